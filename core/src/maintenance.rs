@@ -28,6 +28,12 @@ pub struct DrainRequest {
     /// The robot goes back from what was aborted: it waits for others that change, and for nobody whom only a person brings back.
     #[serde(default)]
     pub returns: bool,
+    /// The robot changes to something new: while the area's window is shut or the area is frozen its drain does not begin.
+    #[serde(default)]
+    pub forward: bool,
+    /// The robot is lost, and a person or the roll-out's policy said that it counts in no budget until it is heard.
+    #[serde(default)]
+    pub written_off: bool,
 }
 
 impl Record for DrainRequest {

@@ -64,9 +64,9 @@ pub struct SoftwareRules {
     pub off_work_permille: u16,
     /// So many robots of the area with this capability stay in work.
     pub keep_in_work: BTreeMap<String, u32>,
-    /// New drains begin only within one of these. Empty: at any time.
+    /// New drains of roll-outs begin only within one of these; what has begun may end. Empty: at any time.
     pub windows: Vec<Window>,
-    /// No new drain begins.
+    /// No new drain of a roll-out begins, and no robot is given permission to change to something new.
     pub frozen: bool,
     /// The gate on rates of task failures ends a roll-out whose bundle a robot of the area has run, also if its spec does not ask for that. See [`crate::rollout::verdict::acts_on_rates`].
     #[serde(default)]

@@ -185,6 +185,8 @@ codes! {
         => "`midshift rollout get ROLLOUT --robots` says how far each of its robots is.";
     QuarantineNotFound = "QUARANTINE_NOT_FOUND", "This robot has no such bundle in quarantine."
         => "`midshift quarantine ls` lists them.";
+    RobotNotLost = "ROBOT_NOT_LOST", "The robot is heard, is not out of work for this roll-out, or has not been silent for as long as the roll-out bears."
+        => "`midshift rollout explain ROLLOUT ROBOT` says what it waits for; once it is lost, an incident says so.";
     // --- why a robot does not get a task
     RobotPinnedElsewhere = "ROBOT_PINNED_ELSEWHERE", "The task names another robot.";
     MissingCapability = "MISSING_CAPABILITY", "The robot cannot do one of the task's actions or lacks a required capability.";
@@ -286,6 +288,8 @@ codes! {
         => "It goes on once one of them is back; the rules of the area may allow more.";
     BlockedByWindow = "WINDOW_CLOSED", "The area's maintenance window is closed, or the area is frozen."
         => "It goes on when the window opens; the rules of the area may open it now.";
+    BlockedBySilence = "ROBOT_SILENT", "The robot is out of work for a roll-out and is not heard."
+        => "Bring it back into reach. If it will not come, say so with `midshift rollout lost`: until it is heard it counts in no budget then, and keeps its drain.";
     BlockedByWave = "WAITING_FOR_WAVE", "Its wave has not begun."
         => "It begins once the wave before is kept; `midshift rollout get` shows what that one does.";
     BlockedByPlaceInWave = "WAITING_FOR_PLACE_IN_WAVE", "As many robots as the roll-out allows are out of work for it."
@@ -331,6 +335,7 @@ codes! {
     FailureAmongFew = "FAILURE_AMONG_FEW", "A robot failed while fewer than ten were attempted.";
     TooManyFailed = "TOO_MANY_FAILED", "More robots failed than a good bundle lets fail.";
     RateTooHigh = "RATE_TOO_HIGH", "Robots with the bundle fail tasks at several times the rate of the others.";
+    EffortTooHigh = "EFFORT_TOO_HIGH", "Robots with the bundle need more time, energy or heat for their work than the others, beyond what the roll-out lets pass. A person must judge it.";
     PromotedByUser = "PROMOTED_BY_USER", "A person let it go on.";
     RetriedByUser = "RETRIED_BY_USER", "A person tries the robot again.";
     AbortedByUser = "ABORTED_BY_USER", "A person ended it.";

@@ -280,12 +280,14 @@ fn release(bundle: BundleId, number: u64, at: Utc) -> Bundle {
         version: version(number),
         manifest_length: 1_000,
         length: 1_000_000,
+        room: 0,
         hardware: Default::default(),
         needs: "restart".to_owned(),
         hard_stop_codes: Default::default(),
         is_irreversible: false,
         has_base: false,
         requires: Default::default(),
+        rollback_index: None,
         listed: false,
         revoked: None,
         published: at,
@@ -315,6 +317,7 @@ fn completed(rollout_id: &RolloutId, bundle: &BundleId, act: Act) -> Rollout {
         superseded_by: None,
         tasks: Default::default(),
         counted: Default::default(),
+        efforts: Default::default(),
         created: act.clone(),
         approved: Some(act.clone()),
         started: Some(act.at),
@@ -346,7 +349,9 @@ fn committed(rollout_id: &RolloutId, robot_id: RobotId, place: u64, at: Utc) -> 
         why: None,
         again: false,
         before: TaskTally::default(),
+        effort_before: Default::default(),
         moments: Default::default(),
+        lost: None,
     }
 }
 

@@ -5,6 +5,7 @@ use crate::once::Asked;
 use crate::policy::AreaPolicy;
 use crate::rows::Table;
 use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
 
 /// One request.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -44,6 +45,15 @@ pub enum Command {
         robot_id: RobotId,
         /// What the person saw.
         reason: String,
+    },
+    /// Labels that go before what the robot says itself.
+    Label {
+        /// Whose.
+        robot_id: RobotId,
+        /// Labels that it gets.
+        labels: BTreeMap<String, String>,
+        /// Keys whose labels by people go: the robot's own word counts again.
+        removed: BTreeSet<String>,
     },
     /// Out of work for maintenance: what it does ends or waits, then it parks.
     Drain {

@@ -1,15 +1,18 @@
 //! How many robots of an area may be out of work at once, and who is next.
 //!
 //! Called by `mod` before drains go on. Invariant: a drain that may wait begins only in an item that also writes its area's row, so two planners
-//! cannot both spend the last place; a robot that is out for several reasons counts once. Robots that charge or have no work are asked
-//! first. Drains of people and urgent ones count and do not wait. Whoever goes back from what was aborted waits for drains alone, and for
-//! those only that end by themselves: a robot that only a person brings back to work would otherwise keep it on bad software for as long. What an
-//! area's rules keep in work by capability holds for it too.
+//! cannot both spend the last place; a robot that is out for several reasons counts once, and one that was written off does not until it is
+//! heard. Robots that charge or have no work are asked first. Drains of people and urgent ones count and do not wait. Whoever changes to
+//! something new waits for the area's window too. The item in which a drain begins relies on the request and on the area's rules: whoever takes
+//! the one back or freezes the other is not passed unseen. Whoever goes back from what was aborted waits for drains alone, and for those only that end by themselves: a robot that only a person brings
+//! back to work would otherwise keep it on bad software for as long. What an area's rules keep in work by capability holds for it too.
 
 use super::rows::{AreaBudget, Drain, DrainState, RobotHolder};
 use super::view::View;
 use super::{Board, Plan, Tx, heard, objects};
 use crate::ids::{AreaId, RobotId};
+use crate::maintenance::{DrainRelease, DrainRequest};
+use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, Presence};
 use crate::task::state::Errand;
@@ -70,8 +73,8 @@ fn is_same(known: &Reason, why: &Reason) -> bool {
 
 /// Lets waiting drains begin as far as the areas' rules allow, and keeps the areas' rows.
 pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
-    let mut waiting: Vec<Drain> =
-        view.drains.values().map(|d| &d.row).filter(|d| d.state == DrainState::Waiting).cloned().collect();
+    let waits = |d: &&Drain| d.state == DrainState::Waiting && !view.drain_releases.contains_key(d.drain_id.as_str());
+    let mut waiting: Vec<Drain> = view.drains.values().map(|d| &d.row).filter(waits).cloned().collect();
     if waiting.is_empty() && view.budgets.is_empty() {
         return;
     }
@@ -85,9 +88,8 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
         let here = objects::area_of(view, board, &drain.robot_id);
         let why = match (&here, view.drain_of(&drain.robot_id)) {
             (_, Some(other)) => Some(Reason::from(Code::RobotDraining).with("drain_id", &other.drain_id)),
-            (Some(area), None) if !drain.urgent => {
-                areas.get_mut(area).and_then(|a| refusal(view, board, &now, area, a, &drain))
-            }
+            (Some(area), None) if !drain.urgent => shut(view, &now, area, &drain)
+                .or_else(|| areas.get_mut(area).and_then(|a| refusal(view, board, &now, area, a, &drain))),
             _ => None,
         };
         if why.is_none()
@@ -97,18 +99,34 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
         }
         plan.decide(view, now, "fleet", |tx| match why {
             Some(why) if drain.why.as_ref().is_some_and(|known| is_same(known, &why)) => {}
-            Some(why) => tx.put(Drain { why: Some(why), ..drain }, "drain.waits"),
+            Some(why) => wait(tx, drain, why, here, &areas),
             None => begin(tx, drain, here, &areas),
         });
     }
+}
+
+/// It waits on; the area's row says for whom, however they came out of work.
+fn wait(tx: &mut Tx, drain: Drain, why: Reason, area_id: Option<AreaId>, areas: &BTreeMap<AreaId, Area>) {
+    if let Some((id, area)) = area_id.as_ref().and_then(|id| areas.get_key_value(id))
+        && tx.view.budgets.get(id.as_str()).is_none_or(|b| b.row != row_of(tx.view, id, area))
+    {
+        put_row(tx, id, area);
+    }
+    tx.put(Drain { why: Some(why), ..drain }, "drain.waits");
 }
 
 fn begin(tx: &mut Tx, drain: Drain, area_id: Option<AreaId>, areas: &BTreeMap<AreaId, Area>) {
     if let Some((id, area)) = area_id.as_ref().and_then(|id| areas.get_key_value(id)) {
         put_row(tx, id, area);
     }
-    let (state, since) = (DrainState::Draining, tx.now.utc);
+    let (state, since, drain_id) = (DrainState::Draining, tx.now.utc, drain.drain_id.clone());
+    let rules = area_id.clone();
     tx.put(Drain { state, since, area_id, why: None, ..drain }, "drain.begun");
+    tx.rely::<DrainRequest>(drain_id.as_str());
+    tx.rely::<DrainRelease>(drain_id.as_str());
+    if let Some(area_id) = rules {
+        tx.rely::<AreaPolicy>(area_id.as_str());
+    }
 }
 
 fn put_row(tx: &mut Tx, area_id: &AreaId, area: &Area) {
@@ -165,7 +183,8 @@ fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
             area.draining.insert(robot_id.clone());
         }
     }
-    for drain in view.drains.values().map(|d| &d.row).filter(|d| d.is_on()) {
+    let counts = |drain: &&Drain| drain.is_on() && !is_written_off(view, board, now, drain);
+    for drain in view.drains.values().map(|d| &d.row).filter(counts) {
         if let Some(area_id) = &drain.area_id {
             let area = areas.entry(area_id.clone()).or_default();
             area.off_work.insert(drain.robot_id.clone());
@@ -177,11 +196,24 @@ fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
     areas
 }
 
+/// The robot is not heard, and a person or its roll-out's policy said that it counts in no budget until it is.
+fn is_written_off(view: &View, board: &Board, now: &Now, drain: &Drain) -> bool {
+    let said = view.drain_requests.get(drain.drain_id.as_str()).is_some_and(|request| request.row.written_off);
+    said && heard::presence(board, &drain.robot_id, now) == Presence::Offline
+}
+
 /// The robot is heard, and is not stuck with what it runs: its drain ends without a person.
 fn comes_to_an_end(board: &Board, now: &Now, robot_id: &RobotId) -> bool {
     let is_stuck =
         board.get(robot_id).and_then(|l| l.report.update.as_ref()).is_some_and(|u| u.state == UpdateState::Stuck);
     !is_stuck && heard::presence(board, robot_id, now) != Presence::Offline
+}
+
+/// Why a robot that changes to something new does not leave its work now, however many are out of it.
+fn shut(view: &View, now: &Now, area_id: &AreaId, drain: &Drain) -> Option<Reason> {
+    let forward = view.drain_requests.get(drain.drain_id.as_str()).is_some_and(|request| request.row.forward);
+    let shut = forward && !view.policy(area_id).software.is_open(now);
+    shut.then(|| Reason::from(Code::BlockedByWindow).with("area_id", area_id))
 }
 
 /// Why one more robot may not leave its work now.

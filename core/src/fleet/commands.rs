@@ -13,6 +13,8 @@ use crate::limits;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
 use crate::robot::Presence;
 use crate::rows::{Item, Record, Revision, Writer};
+use crate::task::raw::check_labels;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Checks a command against what is known; an error changes nothing.
 pub fn check(
@@ -28,6 +30,7 @@ pub fn check(
         | Command::Retire { robot_id, .. }
         | Command::Disown { robot_id, .. }
         | Command::SettleLoad { robot_id, .. }
+        | Command::Label { robot_id, .. }
         | Command::Drain { robot_id, .. }
         | Command::Undrain { robot_id } => {
             if !view.sessions.contains_key(robot_id.as_str()) {
@@ -42,6 +45,9 @@ pub fn check(
             }
             if let Command::SettleLoad { .. } = command {
                 load::may_settle(view, board, now, robot_id)?;
+            }
+            if let Command::Label { labels, removed, .. } = command {
+                may_label(view, robot_id, labels, removed)?;
             }
             view.control.get(robot_id.as_str()).map_or(Revision(0), |c| c.revision)
         }
@@ -89,6 +95,35 @@ pub fn check(
     }
 }
 
+/// What people may say of a robot is what it may say of itself.
+fn may_label(
+    view: &View,
+    robot_id: &RobotId,
+    labels: &BTreeMap<String, String>,
+    removed: &BTreeSet<String>,
+) -> Result<(), Refusal> {
+    let mut bad = Violations::default();
+    if labels.is_empty() && removed.is_empty() {
+        bad.add("labels", "is required, or removed is");
+    }
+    if labels.keys().any(|key| removed.contains(key)) {
+        bad.add("removed", "must not name a label that is put");
+    }
+    let known = view.control.get(robot_id.as_str()).map(|c| c.row.labels.clone()).unwrap_or_default();
+    check_labels(&relabeled(known, labels, removed), "labels", &mut bad);
+    bad.finish()
+}
+
+fn relabeled(
+    mut known: BTreeMap<String, String>,
+    labels: &BTreeMap<String, String>,
+    removed: &BTreeSet<String>,
+) -> BTreeMap<String, String> {
+    known.retain(|key, _| !removed.contains(key));
+    known.extend(labels.iter().map(|(key, value)| (key.clone(), value.clone())));
+    known
+}
+
 /// An attempt is ignored only while its robot is heard, stands still, lists it as its own, and no row knows it: not right after it turned out to
 /// know more than a restored store.
 fn may_disown(
@@ -128,6 +163,11 @@ pub fn note(view: &View, command: &Command) -> Note {
             of_robot("robot.disown", robot_id).because(reason).with("attempt", attempt.to_string())
         }
         Command::SettleLoad { robot_id, reason } => of_robot("robot.settle_load", robot_id).because(reason),
+        Command::Label { robot_id, labels, removed } => {
+            let put: Vec<String> = labels.iter().map(|(key, value)| format!("{key}={value}")).collect();
+            let removed: Vec<&str> = removed.iter().map(String::as_str).collect();
+            of_robot("robot.label", robot_id).with("labels", put.join(" ")).with("removed", removed.join(" "))
+        }
         Command::Drain { robot_id, reason, within_ms } => {
             of_robot("robot.drain", robot_id).because(reason).with("within_ms", within_ms)
         }
@@ -192,6 +232,11 @@ pub fn apply(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
             let mut control = control(tx, robot_id);
             control.load_settled = Some(load::settle(tx, board, robot_id, reason, actor));
             tx.put(control, "robot.load_settled");
+        }
+        Command::Label { robot_id, labels, removed } => {
+            let control = control(tx, robot_id);
+            let labels = relabeled(control.labels.clone(), labels, removed);
+            tx.put(RobotControl { labels, ..control }, "robot.labeled");
         }
         Command::Drain { robot_id, reason, within_ms } => drain::ask(tx, robot_id, reason, actor, *within_ms),
         Command::Undrain { robot_id } => drain::release(tx, robot_id),

@@ -75,6 +75,7 @@ pub fn permit(view: &View, board: &Board, by: &Caller, command: &Command) -> Res
         | Command::Retire { robot_id, .. }
         | Command::Disown { robot_id, .. }
         | Command::SettleLoad { robot_id, .. }
+        | Command::Label { robot_id, .. }
         | Command::Drain { robot_id, .. }
         | Command::Undrain { robot_id } => {
             if !view.sessions.contains_key(robot_id.as_str()) {

@@ -3,7 +3,7 @@
 use super::asked::Command;
 use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, RolloutId, SiteId, StopId, TaskId};
 use crate::reason::Reason;
-use crate::robot::Duty;
+use crate::robot::{Duty, Inventory};
 use crate::rows::{Index, Record, Seq, Table};
 use crate::time::Utc;
 use crate::work::WorkStats;
@@ -161,6 +161,9 @@ pub struct RobotControl {
     /// Fleet stops that people resumed for it, oldest first, until it is heard to wait for them no more.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub resumed: Vec<StopId>,
+    /// Labels that people gave it; they go before what it says itself.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub labels: BTreeMap<String, String>,
 }
 
 impl RobotControl {
@@ -179,7 +182,13 @@ impl RobotControl {
             errands: 0,
             tasks: 0,
             resumed: Vec::new(),
+            labels: BTreeMap::new(),
         }
+    }
+    /// A label of a robot: what people said, or else what it says itself.
+    pub fn label<'a>(control: Option<&'a Self>, inventory: &'a Inventory, key: &str) -> Option<&'a str> {
+        let put = control.and_then(|control| control.labels.get(key));
+        put.or_else(|| inventory.labels.get(key)).map(String::as_str)
     }
     /// Whether it gets work.
     pub fn duty(&self) -> Duty {

@@ -3,7 +3,7 @@
 //! Invariant: a filter gives a reason; nothing is ever "just not chosen".
 
 use super::queue::Wait;
-use super::rows::RobotHolder;
+use super::rows::{RobotControl, RobotHolder};
 use super::view::View;
 use super::{Board, Slice, claims, heard, load, maps, plausible, standing, way};
 use crate::energy::Trip;
@@ -119,7 +119,7 @@ pub fn pair(
     let Some(session) = view.sessions.get(robot_id.as_str()).map(|s| &s.row) else {
         return Err(Code::RobotOffline.into());
     };
-    fits(robot_id, session, task, intake)?;
+    fits(view, session, task, intake)?;
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
     just_refused(view, live, task)?;
     let load = load::carried(view, live);
@@ -147,9 +147,9 @@ pub fn pair(
 }
 
 /// What does not pass by itself: pin, binding, what the robot refused or failed for good, and what it said of itself at its last Hello.
-fn fits(robot_id: &RobotId, session: &Session, task: &TaskState, intake: &TaskIntake) -> Result<(), Reason> {
-    bound(robot_id, task, intake)?;
-    able(session, intake)
+fn fits(view: &View, session: &Session, task: &TaskState, intake: &TaskIntake) -> Result<(), Reason> {
+    bound(&session.robot_id, task, intake)?;
+    able(view, session, intake)
 }
 
 /// Whether the task itself leaves the robot out, whatever it can do.
@@ -180,7 +180,7 @@ pub(super) fn could_ever(view: &View, task: &TaskState, intake: &TaskIntake, sli
     let mut against: BTreeMap<Code, u64> = BTreeMap::new();
     for session in view.sessions.iter().filter(|(id, _)| !retired(id)).map(|(_, session)| &session.row) {
         slice.look(1);
-        match fits(&session.robot_id, session, task, intake) {
+        match fits(view, session, task, intake) {
             Ok(()) => return Ok(()),
             Err(reason) => *against.entry(reason.code).or_default() += 1,
         }
@@ -215,14 +215,16 @@ fn just_refused(view: &View, live: &Live, task: &TaskState) -> Result<(), Reason
     }
 }
 
-fn able(session: &Session, intake: &TaskIntake) -> Result<(), Reason> {
+fn able(view: &View, session: &Session, intake: &TaskIntake) -> Result<(), Reason> {
     let spec = &intake.spec;
     let has = |c: &str| session.inventory.capabilities.iter().any(|h| h == c);
     let wanted = spec.actions().into_iter().chain(spec.selector.capabilities.iter().map(String::as_str));
     if let Some(missing) = wanted.into_iter().find(|c| !has(c)) {
         return Err(Reason::from(Code::MissingCapability).with("capability", missing));
     }
-    if spec.selector.labels.iter().any(|(k, v)| session.inventory.labels.get(k) != Some(v)) {
+    let control = view.control.get(session.robot_id.as_str()).map(|c| &c.row);
+    let label = |key: &str| RobotControl::label(control, &session.inventory, key);
+    if spec.selector.labels.iter().any(|(key, value)| label(key) != Some(value.as_str())) {
         return Err(Code::LabelMismatch.into());
     }
     if spec.selector.payload_g > session.inventory.payload_g {

@@ -5,11 +5,13 @@
 //! Called by the rollout service, which latches an abort with the evidence that made it: a verdict here knows no yesterday.
 
 mod bound;
+mod effort;
 mod evidence;
 mod fixed;
 mod sprt;
 
 pub use bound::{false_abort_permille, upper_bound_permille};
+pub use effort::{Effort, EffortLimits, Efforts};
 pub use evidence::{FailureEvidence, Suspicion, TaskTally};
 pub use sprt::{OutcomeEvidence, RobotOutcomes, Verdict};
 

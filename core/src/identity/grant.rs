@@ -25,6 +25,8 @@ pub enum Permission {
     Author,
     /// Approve roll-outs that somebody else wrote.
     Approve,
+    /// Write a roll-out down that reaches many robots at once, without a small wave before them.
+    Push,
     /// Engage a stop, and see what is stopped.
     Stop,
     /// Reset a stop.
@@ -93,6 +95,7 @@ roles! {
     Operator "operator" [Read Dispatch Operate], "Takes robots out of work and gives them back, resumes, clears places, changes rules of areas.";
     OtaAuthor "ota-author" [Read Author], "Brings software, plans and runs roll-outs.";
     OtaApprover "ota-approver" [Read Approve], "Approves roll-outs that somebody else wrote.";
+    OtaFullPush "ota-full-push" [Read Push], "Lets an ota-author write roll-outs that reach many robots at once.";
     StopOnly "stop-only" [], "Engages stops and sees them: for a panel on a wall.";
     StopResetter "stop-resetter" [Read Reset], "Resets stops.";
     Admin "admin" [Read Administer], "Gives and takes rights, enrols and replaces robots.";
@@ -142,7 +145,7 @@ pub struct Grant {
 /// A grant that cannot be read.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "must be ROLE or ROLE@AREA with a role of viewer, dispatcher, operator, ota-author, ota-approver, stop-only, stop-resetter, admin, auditor"
+    "must be ROLE or ROLE@AREA with a role of viewer, dispatcher, operator, ota-author, ota-approver, ota-full-push, stop-only, stop-resetter, admin, auditor"
 )]
 pub struct BadGrant;
 

@@ -4,7 +4,7 @@
 
 use super::Tx;
 use super::rows::{Moments, Rollout, RolloutRobot, Step, WayBack};
-use crate::gates::TaskTally;
+use crate::gates::{Effort, TaskTally};
 use crate::ids::RobotId;
 use crate::time::{Now, Utc};
 
@@ -45,6 +45,8 @@ pub fn fresh(
         why: None,
         again: false,
         before: TaskTally::default(),
+        effort_before: Effort::default(),
         moments: Moments::default(),
+        lost: None,
     }
 }

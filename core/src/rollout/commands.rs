@@ -3,7 +3,7 @@
 //!
 //! Invariant: a command is checked against the whole picture before anything of it is written; asked twice it does the same once.
 
-use super::dry_run::{bundle, dry_run};
+use super::dry_run::{bundle, dry_run, meets_floor};
 use super::matching::{self, Members, keeps};
 use super::noted::{note, note_of_verb};
 use super::rows::{
@@ -12,9 +12,9 @@ use super::rows::{
 };
 use super::spec::{RolloutSpec, Wave};
 use super::view::View;
-use super::{Board, Plan, Tx, assign, hear, moves, objects, phases, refusals, robots, verdict};
+use super::{Board, Plan, Tx, assign, effort, hear, moves, objects, phases, refusals, robots, verdict};
 use crate::audit::{self, Note};
-use crate::gates::FailureEvidence;
+use crate::gates::{Efforts, FailureEvidence};
 use crate::identity::{Actor, Caller};
 use crate::ids::{BundleId, RobotId, RolloutId};
 use crate::limits;
@@ -51,6 +51,8 @@ pub enum Verb {
     RetryFailed,
     /// Leave a robot out.
     Exclude(RobotId),
+    /// A robot that is lost counts in no budget until it is heard.
+    Lost(RobotId),
 }
 
 /// One request.
@@ -232,7 +234,7 @@ pub fn check(view: &View, board: &Board, command: &Command, seen: Option<Revisio
             let mut bad = Violations::default();
             spec.check(&mut bad);
             bad.finish()?;
-            bundle(view, &spec.bundle)?;
+            meets_floor(bundle(view, &spec.bundle)?, spec)?;
             room(view)
         }
         Command::Rollback { of, rollout_id } => {
@@ -361,6 +363,14 @@ fn verb_fits(view: &View, board: &Board, rollout: &Rollout, verb: &Verb) -> Resu
             let known = known.ok_or_else(|| not_found(Code::RobotNotFound, "robot_id", robot_id))?;
             now_is(known.step < Step::Draining, known.step == Step::Skipped)
         }
+        Verb::Lost(robot_id) => {
+            let known = view.robot_of(&rollout.rollout_id, robot_id);
+            let known = known.ok_or_else(|| not_found(Code::RobotNotFound, "robot_id", robot_id))?;
+            let after = rollout.spec.lost_after_ms;
+            let reason = || Reason::from(Code::RobotNotLost).with("robot_id", robot_id).with("lost_after_ms", after);
+            let lost = known.lost.as_ref().ok_or_else(|| Refusal::new(Kind::Precondition, reason()))?;
+            Ok(lost.written_off.is_some())
+        }
     }
 }
 
@@ -450,6 +460,9 @@ fn apply_one(tx: &mut Tx, board: &Board, command: &Command, actor: &Actor) {
             let Some(row) = tx.view.bundles.get(bundle.as_str()).map(|b| b.row.clone()) else { return };
             let revoked = Some(act(tx, actor, reason));
             tx.put(Bundle { revoked, ..row }, "bundle.revoked");
+            let is_of = |r: &&Rollout| r.spec.bundle == *bundle && r.revert_of.is_none();
+            let of: Vec<Rollout> = tx.view.rollouts.values().map(|r| &r.row).filter(is_of).cloned().collect();
+            of.into_iter().for_each(|rollout| phases::revoke(tx, rollout));
         }
         Command::Pin { robot_id, reason } => {
             let pin = Some(act(tx, actor, reason));
@@ -500,6 +513,7 @@ fn draft(tx: &Tx, rollout_id: &RolloutId, spec: Arc<RolloutSpec>, actor: &Actor)
         superseded_by: None,
         tasks: FailureEvidence::default(),
         counted: Arc::default(),
+        efforts: Efforts::default(),
         created: act(tx, actor, ""),
         approved: None,
         started: None,
@@ -542,6 +556,11 @@ fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &Act
             let row = RolloutRobot::id_of(id, robot_id);
             moves::make(tx, &super::NoSign, board, &row, robots::Move::Skip(why(Code::SkippedExcluded)));
         }
+        Verb::Lost(robot_id) => {
+            let Some(row) = tx.view.robot_of(id, robot_id).cloned() else { return };
+            let act = act(tx, actor, reason);
+            moves::write_off(tx, row, act);
+        }
         Verb::Start { .. } | Verb::RetryFailed => {}
     }
 }
@@ -551,7 +570,8 @@ fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bo
     let Ok((robots, sizes)) = members(view, board, &rollout) else { return };
     let others = overlapping(view, &rollout, robots.iter().map(|(id, ..)| id));
     let control = verdict::controls_of(view, &rollout);
-    let counted = Arc::new(Counted { at_ms: view.served_ms(&now), control, ..Counted::default() });
+    let effort = effort::of_controls(view, &rollout);
+    let counted = Arc::new(Counted { at_ms: view.served_ms(&now), control, effort, ..Counted::default() });
     if supersede {
         for other in &others {
             plan.decide(view, now, actor, |tx| {

@@ -48,15 +48,31 @@ pub fn bundle<'a>(view: &'a View, id: &BundleId) -> Result<&'a Bundle, Refusal> 
     Ok(bundle)
 }
 
+/// Whether the bundle meets the floor that is asked for.
+///
+/// # Errors
+/// Every robot would refuse it.
+pub fn meets_floor(bundle: &Bundle, spec: &RolloutSpec) -> Result<(), Refusal> {
+    match bundle.rollback_index.filter(|index| *index < spec.rollback_floor) {
+        Some(index) => {
+            let rule = format!("must be at most {index}, the lowest of the bundle: every robot would refuse it");
+            Err(Refusal::field("rollback_floor", rule))
+        }
+        None => Ok(()),
+    }
+}
+
 /// What a roll-out would do, or everything that speaks against it.
 ///
 /// # Errors
-/// A bundle that is not there; rules that are broken; nobody matched; a first wave that is too large; a budget that lets nobody out.
+/// A bundle that is not there; rules that are broken; a floor above the bundle; nobody matched; a first wave that is too large; a budget that
+/// lets nobody out.
 pub fn dry_run(view: &View, board: &Board, id: &RolloutId, spec: &RolloutSpec) -> Result<DryRun, Refusal> {
     let mut bad = Violations::default();
     spec.check(&mut bad);
     bad.finish()?;
     let bundle = bundle(view, &spec.bundle)?;
+    meets_floor(bundle, spec)?;
     let matching = matching::of(view, board, id, spec, bundle);
     let robots = matching.robots.len();
     if robots == 0 {
@@ -162,9 +178,11 @@ fn caveats(view: &View, board: &Board, spec: &RolloutSpec, bundle: &Bundle, matc
         (!ids.is_empty()).then(|| format!("{}{rest}", ids[..ids.len().min(NAMED_MAX)].join(", ")))
     };
     // Heartbeats tell what has changed since.
-    let room = |i: &Installed| board.get(&i.robot_id).and_then(|l| l.report.free_bytes).unwrap_or(i.free_bytes);
-    if let Some(robots) = named(&|i| room(i) < bundle.length) {
-        caveats.push(format!("less room than its {} bytes, as said last: {robots}", bundle.length));
+    let free = |i: &Installed| board.get(&i.robot_id).and_then(|l| l.report.free_bytes).unwrap_or(i.free_bytes);
+    let room = bundle.room.max(bundle.length);
+    if let Some(robots) = named(&|i| free(i) < room) {
+        let what = "for a third set and a file as it comes";
+        caveats.push(format!("less room than {room} bytes, {what}, as said last: {robots}"));
     }
     for (name, version) in &bundle.requires {
         if let Some(robots) = named(&|i| lacks(i, name, version)) {

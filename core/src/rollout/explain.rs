@@ -1,11 +1,16 @@
 //! What one robot of a roll-out waits for, since when, and until when at most. Reads only; the planner's own questions.
+//!
+//! Invariant: a moment until which something is waited for lies ahead; what is overdue waits as long as it takes.
 
 use super::rows::{Countdown, Phase, Rollout, RolloutRobot, Step};
 use super::view::View;
-use super::{Board, hear, moves, robots, turns};
+use super::{Board, hear, infrastructure, moves, robots, turns};
+use crate::fleet::heard;
 use crate::fleet::rows::{Drain, DrainState};
+use crate::ids::RobotId;
 use crate::limits;
 use crate::reason::{Code, Reason};
+use crate::robot::Presence;
 use crate::time::{Now, Utc};
 use crate::update::UpdateState;
 
@@ -25,6 +30,58 @@ pub struct Blocked {
 
 /// What `r` waits for; none: nothing is left to do.
 pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
+    let waits = silent(view, board, now, rollout, r).or_else(|| waits_for(view, board, now, rollout, r))?;
+    let by = named(view, board, now, rollout, waits.by);
+    Some(Blocked { by, deadline: waits.deadline.filter(|deadline| *deadline > now.utc), ..waits })
+}
+
+/// A robot that is out of work and is not heard waits for nothing else: since when, and until when nobody is told.
+fn silent(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
+    r.drain_id.as_ref().filter(|id| view.drain(id).is_some_and(Drain::is_on))?;
+    if heard::presence(board, &r.robot_id, now) != Presence::Offline {
+        return None;
+    }
+    let left_ms = rollout.spec.lost_after_ms.saturating_sub(infrastructure::silent_ms(view, board, now, &r.robot_id));
+    let heard_ms = board.get(&r.robot_id).map(|live| now.site.since(live.processed_site).as_ms());
+    let since = heard_ms.map_or(r.since, |ms| Utc(now.utc.0.saturating_sub_unsigned(ms)));
+    let deadline = r.lost.is_none().then(|| now.utc.plus_ms(left_ms));
+    let by = Reason::from(Code::BlockedBySilence).with("lost", r.lost.is_some()).with("counts", r.counts());
+    Some(Blocked { by, since, deadline })
+}
+
+/// A reason that waits for room, with the robots that have it now.
+fn named(view: &View, board: &Board, now: &Now, rollout: &Rollout, by: Reason) -> Reason {
+    let of_rollout = |r: &&RolloutRobot| r.drain_id.is_some() && r.counts();
+    let robots: Vec<&RobotId> = match by.code {
+        Code::BlockedByBudget => {
+            let area = by.metadata.get("area_id").and_then(|area| view.budgets.get(area));
+            area.map(|area| area.row.off_work.iter().collect()).unwrap_or_default()
+        }
+        Code::BlockedByPlaceInWave => {
+            view.robots_of(&rollout.rollout_id).filter(of_rollout).map(|r| &r.robot_id).collect()
+        }
+        _ => return by,
+    };
+    let name = |id: &&RobotId| match heard::presence(board, id, now) {
+        Presence::Offline => format!("{id} (not heard)"),
+        _ => format!("{id}"),
+    };
+    let names: Vec<String> = robots.iter().take(limits::CROWD_NAMED_MAX).map(name).collect();
+    if names.is_empty() {
+        return by;
+    }
+    let more = match robots.len() - names.len() {
+        0 => String::new(),
+        more => format!(" and {more} more"),
+    };
+    let names = names.join(", ") + &more;
+    let message = format!("{} They are {names}.", by.code.help());
+    let mut told = by.with("held_by", names);
+    told.message = message;
+    told
+}
+
+fn waits_for(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
     let mut since = r.since;
     let mut deadline = None;
     if let Some(code) = view.keyless

@@ -23,6 +23,11 @@ pub fn is_missing(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &
     watched && now.link.since(heard(view, board, &r.robot_id)) >= limits::LOST_AFTER
 }
 
+/// Milliseconds of link time since a robot was heard last.
+pub fn silent_ms(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> u64 {
+    now.link.since(heard(view, board, robot_id)).as_ms()
+}
+
 /// When a robot was heard last. After a start everybody counts as heard at that moment.
 fn heard(view: &View, board: &Board, robot_id: &RobotId) -> LinkTime {
     board.get(robot_id).map_or(view.started.link, |live| live.processed_at.max(view.started.link))

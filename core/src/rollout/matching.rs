@@ -7,6 +7,7 @@ use super::rows::{Act, Bundle, Quarantine, Rollout, RolloutRobot, Step};
 use super::spec::{RolloutSpec, Wave};
 use super::view::View;
 use crate::fleet::Board;
+use crate::fleet::rows::RobotControl;
 use crate::ids::{AreaId, RobotId, RolloutId};
 use crate::reason::{Code, Reason};
 use crate::robot::Duty;
@@ -137,7 +138,8 @@ pub fn stratum(view: &View, board: &Board, robot_id: &RobotId) -> Option<Stratum
 }
 
 fn label<'a>(view: &'a View, robot_id: &RobotId, key: &str) -> Option<&'a str> {
-    view.sessions.get(robot_id.as_str())?.row.inventory.labels.get(key).map(String::as_str)
+    let control = view.control.get(robot_id.as_str()).map(|c| &c.row);
+    RobotControl::label(control, &view.sessions.get(robot_id.as_str())?.row.inventory, key)
 }
 
 /// Whether a roll-out is for a robot, as far as its selector goes.

@@ -5,13 +5,14 @@
 //! would not take); `matching` says who and `dry_run` what it would come to, `robots` says what is due for each (`turns`: whose turn it is)
 //! and `moves` writes it, `phases` the whole, `ending` whether enough have it at the end, `newcomers` who comes later (`served`: what they
 //! get; `assign`: how anybody comes in), `named` which bundles are still needed, `past` what the picture holds of what has ended; `verdict`,
-//! `jams` and `infrastructure` judge; `explain` says what a robot waits for. Rooms name each other in one direction only.
+//! `jams` and `infrastructure` judge, with what `effort` saw; `explain` says what a robot waits for. Rooms name each other in one direction only.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod assign;
 pub mod bugs;
 pub mod commands;
 pub mod dry_run;
+pub mod effort;
 pub mod ending;
 pub mod explain;
 pub mod hear;
@@ -67,6 +68,8 @@ pub struct Order<'a> {
     pub bundle: &'a BundleId,
     /// Bytes of its manifest.
     pub manifest_length: u64,
+    /// No component may have a lower `rollback_index`.
+    pub rollback_floor: u64,
     /// For which roll-out.
     pub rollout_id: &'a RolloutId,
     /// UTC of the wall.

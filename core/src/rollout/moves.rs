@@ -1,19 +1,20 @@
 //! Writes what is due for a robot: its row, what it should run, drains asked for and released, permissions.
 //!
-//! Called with what [`super::robots::next`] said. Invariant: one move is one item; a permission relies on fleet's record of the robot and on the
-//! roll-out's row, and robots out of work are counted in that row.
+//! Called with what [`super::robots::next`] said. Invariant: one move is one item; a permission relies on fleet's record of the robot, on the rules
+//! of its area and on the roll-out's row, and robots out of work are counted in that row.
 
 use super::hear::{fail, is_hard, is_old, quarantine};
 use super::infrastructure::is_open_to;
-use super::robots::{Move, anchor, wants};
-use super::rows::{Given, Rollout, RolloutRobot, Step, WayBack};
+use super::robots::{Move, anchor, area_ahead, is_asked, wants};
+use super::rows::{Act, Given, Lost, Rollout, RolloutRobot, Step, WayBack};
 use super::stamp::Stamp;
 use super::turns::is_retried;
 use super::view::View;
-use super::{Board, Order, Sign, Tx, ending, newcomers, verdict};
+use super::{Board, Order, Sign, Tx, effort, ending, newcomers, verdict};
 use crate::ids::{DrainId, RobotId, RolloutId};
 use crate::limits;
 use crate::maintenance::{DrainRelease, DrainRequest, ReleasedBy};
+use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason};
 use crate::robot::Duty;
 use crate::time::Now;
@@ -71,14 +72,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
             tx.put(r, "robot.grant_not_used");
         }
-        Move::LeaveDrain(to) => {
-            if to == Step::Staged {
-                desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Stage, None, None));
-            }
-            let released_by = unpermitted(&r);
-            leave_drain(tx, &mut r, released_by);
-            step(tx, r, to, "robot.drain_left");
-        }
+        Move::LeaveDrain(to) => give_up_drain(tx, r, to),
         Move::Switched => {
             (r.moments.switched, r.moments.switched_link) = (Some(tx.now.utc), Some(stamp(tx)));
             // It runs, whatever the rows know of a permission: a store that was restored has forgotten some.
@@ -90,6 +84,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             r.moments.switched_link.get_or_insert(stamp(tx));
             r.moments.on_trial = Some(tx.now.utc);
             r.before = verdict::work_of(tx.view, &rollout, &r.robot_id);
+            r.effort_before = effort::of_robot(tx.view, &rollout, &r.robot_id);
             if is_open_to(&rollout, &r) {
                 r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
             }
@@ -142,6 +137,13 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             r.attempted = true;
             newcomers::failed(tx, &rollout, &r);
             step(tx, r, Step::Stuck, "robot.stuck");
+        }
+        Move::Lost => lose(tx, &rollout, r),
+        Move::Heard => {
+            if !r.counts() {
+                recount(tx, &r, 1);
+            }
+            tx.put(RolloutRobot { lost: None, ..r }, "robot.heard_again");
         }
     }
 }
@@ -233,6 +235,7 @@ fn direct(
         generation,
         bundle: &bundle.bundle,
         manifest_length: bundle.manifest_length,
+        rollback_floor: if goal == Goal::Revert { 0 } else { rollout.spec.rollback_floor },
         rollout_id: &rollout.rollout_id,
         issued_at: tx.now.wall,
     };
@@ -303,18 +306,77 @@ fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool)
         within_ms: rollout.spec.drain_within_ms,
         urgent,
         returns,
+        forward: rollout.revert_of.is_none() && r.step == Step::Staged,
+        written_off: !r.counts(),
     };
     tx.put(request, "drain.requested");
     r.drain_id = Some(drain_id);
     (r.ready, r.grant, r.not_used) = (false, None, false);
-    count(tx, &r.rollout_id, 1);
+    if r.counts() {
+        count(tx, &r.rollout_id, 1);
+    }
 }
 
 fn leave_drain(tx: &mut Tx, r: &mut RolloutRobot, why: ReleasedBy) {
     let Some(drain_id) = r.drain_id.take() else { return };
     (r.ready, r.grant) = (false, None);
     tx.put(DrainRelease { drain_id, why }, "drain.release");
-    count(tx, &r.rollout_id, -1);
+    if r.counts() {
+        count(tx, &r.rollout_id, -1);
+    }
+}
+
+/// A person is told of a robot that is lost; the roll-out's policy may say the rest.
+fn lose(tx: &mut Tx, rollout: &Rollout, mut r: RolloutRobot) {
+    let reason = Reason::from(Code::BlockedBySilence).with("rollout_id", &r.rollout_id);
+    super::incident(tx, Some(&r.robot_id), &reason.with("lost_after_ms", rollout.spec.lost_after_ms));
+    r.lost = Some(Lost { since: tx.now.utc, written_off: None });
+    if rollout.spec.writes_off_lost {
+        let reason = "its policy says so".to_owned();
+        let act = Act { actor: "ota".to_owned(), person: None, reason, at: tx.now.utc };
+        return write_off(tx, r, act);
+    }
+    tx.put(r, "robot.lost");
+}
+
+/// A robot that is lost counts in no budget until it is heard. It keeps its drain.
+pub fn write_off(tx: &mut Tx, mut r: RolloutRobot, act: Act) {
+    let counted = r.counts();
+    let Some(lost) = &mut r.lost else { return };
+    lost.written_off = Some(act);
+    if counted {
+        recount(tx, &r, -1);
+    }
+    tx.put(r, "robot.written_off");
+}
+
+/// The drain of a robot counts for fleet and for the roll-out from now on, or does not.
+fn recount(tx: &mut Tx, r: &RolloutRobot, by: i32) {
+    let request = r.drain_id.as_ref().and_then(|id| tx.view.requests.get(id.as_str())).map(|q| q.row.clone());
+    if let Some(request) = request {
+        tx.put(DrainRequest { written_off: by < 0, ..request }, "drain.recounted");
+        count(tx, &r.rollout_id, by);
+    }
+}
+
+/// Leaves a drain in which no permission may be alive.
+fn give_up_drain(tx: &mut Tx, mut r: RolloutRobot, to: Step) {
+    if to == Step::Staged {
+        desire(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Stage, None, None));
+    }
+    let released_by = unpermitted(&r);
+    leave_drain(tx, &mut r, released_by);
+    step(tx, r, to, "robot.drain_left");
+}
+
+/// Takes back what was asked of fleet for a roll-out that goes on no more, in the item that says so: no drain that waits begins after it. Those
+/// for which the item has no room are taken back one by one.
+pub fn take_back_asked(tx: &mut Tx, rollout_id: &RolloutId) {
+    // The robot, what it is told, and the release.
+    let room = limits::ITEM_ROWS_MAX.saturating_sub(tx.rows()) / 4;
+    let asked = tx.view.robots_of(rollout_id).filter(|r| is_asked(tx.view, r));
+    let asked: Vec<RolloutRobot> = asked.take(room).cloned().collect();
+    asked.into_iter().for_each(|r| give_up_drain(tx, r, Step::Staged));
 }
 
 /// One more or less is out of work for a roll-out: the row that two planners fight over.
@@ -329,6 +391,9 @@ fn grant(tx: &mut Tx, board: &Board, rollout: &Rollout, mut r: RolloutRobot) {
     // Fleet's record must still say so when this is written.
     tx.rely::<crate::fleet::rows::RobotAuthority>(r.robot_id.as_str());
     tx.rely::<Rollout>(rollout.rollout_id.as_str());
+    if let Some(area) = area_ahead(tx.view, board, rollout, &r) {
+        tx.rely::<AreaPolicy>(area.as_str());
+    }
     let grant_id = number(tx);
     let given = ActivationGrant { grant_id, drain_id, authority };
     desire(tx, &r.robot_id, |d| d.grant = Some(given));

@@ -47,7 +47,12 @@ fn acts_on(view: &View, by: &Caller, permission: Permission, rollout_id: &Rollou
 pub fn permit(view: &View, board: &Board, by: &Caller, command: &Command) -> Result<(), Refusal> {
     let author = Permission::Author;
     match command {
-        Command::Create { spec, .. } => by.needs(author, &spec.selector.areas),
+        Command::Create { spec, .. } => {
+            let areas = &spec.selector.areas;
+            by.needs(author, areas)?;
+            // Another right than to write one: many robots meet a bad bundle before a gate has seen it.
+            if spec.allow_full_push { by.needs(Permission::Push, areas) } else { Ok(()) }
+        }
         Command::Rollback { of, .. } => acts_on(view, by, author, of),
         Command::Do { rollout_id, verb: Verb::Approve, .. } => {
             acts_on(view, by, Permission::Approve, rollout_id)?;

@@ -10,7 +10,7 @@ use super::stamp::Stamp;
 use super::turns::{is_newcomer, is_retried};
 use super::verdict;
 use super::view::View;
-use super::{Board, Tx, assign, ending, incident, infrastructure, matching, refusals};
+use super::{Board, Tx, assign, ending, incident, infrastructure, matching, moves, refusals};
 use crate::ids::RolloutId;
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -92,7 +92,23 @@ pub fn set_pauses(tx: &mut Tx, mut rollout: Rollout, pauses: BTreeSet<Pause>, ki
     rollout.version += 1;
     rollout.pauses = pauses;
     rollout.resumed = runs.then_some(tx.now.utc).or(rollout.resumed);
+    let id = rollout.rollout_id.clone();
     tx.put(rollout, kind);
+    if !runs && !tx.view.bugs.pause_is_forgotten() {
+        moves::take_back_asked(tx, &id);
+    }
+}
+
+/// Its bundle is taken back: it stands still in the same item.
+pub fn revoke(tx: &mut Tx, rollout: Rollout) {
+    if rollout.phase.runs() {
+        let mut pauses = rollout.pauses.clone();
+        if pauses.insert(Pause::Revoked) {
+            set_pauses(tx, rollout, pauses, "rollout.pauses_changed");
+        }
+    } else {
+        moves::take_back_asked(tx, &rollout.rollout_id);
+    }
 }
 
 /// Ends it if something speaks against its bundle. True: it ends.
@@ -121,7 +137,11 @@ pub fn abort(
     rollout.verdicts.extend(verdict);
     rollout.generation += 1;
     (rollout.soak, rollout.exposure) = (None, None);
+    let id = rollout.rollout_id.clone();
     enter(tx, rollout, Phase::Aborting, "rollout.aborting");
+    if !tx.view.bugs.pause_is_forgotten() {
+        moves::take_back_asked(tx, &id);
+    }
 }
 
 fn is_offline(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bool {

@@ -1,8 +1,8 @@
 //! Brings each robot of a roll-out a step further: fetch, drain, permission, trial, commit, and back.
 //!
-//! [`next`] says what is due and [`super::moves`] writes it, so that the planner and an explanation see the same. Invariants: permission is given only
-//! while fleet's record says that this drain holds the robot and the roll-out runs; a drain is released only for one of [`crate::maintenance::ReleasedBy`]; robots
-//! out of work for a roll-out are counted in its row, in the item that takes one more.
+//! [`next`] says what is due and [`super::moves`] writes it, so that the planner and an explanation see the same. Invariants: permission is given
+//! only while fleet's record says that this drain holds the robot, the roll-out runs and nobody has frozen the area; a drain is released only for
+//! one of [`crate::maintenance::ReleasedBy`]; robots out of work for a roll-out are counted in its row, in the item that takes one more.
 
 use super::hear::{is_hard, is_old, report_of};
 use super::rows::{Given, Pause, Phase, Rollout, RolloutRobot, Step};
@@ -10,11 +10,12 @@ use super::turns::{is_late, is_newcomer, is_on, is_retried};
 use super::view::View;
 use super::{Board, infrastructure, jams, matching, served, verdict};
 use crate::authority::Authority;
+use crate::fleet::heard;
 use crate::fleet::rows::DrainState;
-use crate::ids::{RobotId, RolloutId};
+use crate::ids::{AreaId, RobotId, RolloutId};
 use crate::limits;
 use crate::reason::{Code, Reason};
-use crate::robot::{Duty, HardwareStop};
+use crate::robot::{Duty, HardwareStop, Presence};
 use crate::time::Now;
 use crate::update::{Goal, UpdateReport, UpdateState};
 
@@ -65,6 +66,10 @@ pub enum Move {
     RolledBack(Reason),
     /// It could not go back.
     Stuck(Reason),
+    /// It is out of work and not heard for longer than the roll-out bears.
+    Lost,
+    /// It was lost, and is heard.
+    Heard,
 }
 
 /// What is due for `r` now, if anything.
@@ -72,12 +77,16 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
     if view.duty(&r.robot_id) == Duty::Retired && !r.step.is_over() {
         return Some(Move::Skip(Code::SkippedRetired.into()));
     }
+    let is_silent = heard::presence(board, &r.robot_id, now) == Presence::Offline;
+    if r.lost.is_some() && !is_silent {
+        return Some(Move::Heard);
+    }
     let report = report_of(view, board, r).filter(|report| report.directive >= r.directive);
-    match r.step {
+    let due = match r.step {
         Step::Waiting => waiting(view, board, now, rollout, r),
         Step::Staging => staging(view, board, now, rollout, r, report),
         Step::Staged => staged(view, board, now, rollout, r, report),
-        Step::Draining => draining(view, now, rollout, r),
+        Step::Draining => draining(view, board, now, rollout, r),
         Step::Activating => activating(view, board, now, rollout, r, report),
         Step::Trial => trial(view, board, now, rollout, r, report),
         Step::Committing => committing(view, rollout, r, report),
@@ -90,7 +99,10 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
         Step::Stuck => {
             report.filter(|r| r.state == UpdateState::RolledBack).map(|_| Move::RolledBack(Code::RollbackFailed.into()))
         }
-    }
+    };
+    let is_out = is_silent && r.drain_id.is_some() && r.lost.is_none();
+    let is_long = || infrastructure::silent_ms(view, board, now, &r.robot_id) >= rollout.spec.lost_after_ms;
+    due.or_else(|| (is_out && is_long()).then_some(Move::Lost))
 }
 
 fn is_tried_again(rollout: &Rollout, r: &RolloutRobot) -> bool {
@@ -253,13 +265,23 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
     if let Some(other) = matching::claimed_by(view, &r.robot_id, &r.rollout_id) {
         return Some(Reason::from(Code::BlockedByRollout).with("rollout_id", other));
     }
-    let area = board.get(&r.robot_id).and_then(|live| view.area_of(live));
-    let area = area.or_else(|| view.software.get(r.robot_id.as_str()).and_then(|s| s.row.area.clone()));
-    if let Some(area) = area.filter(|area| !view.policy(area).software.is_open(now)) {
+    if let Some(area) = shut(view, board, now, rollout, r) {
         return Some(Reason::from(Code::BlockedByWindow).with("area_id", area));
     }
     let most = in_flight_max(view, rollout);
     (rollout.in_flight >= most).then(|| Reason::from(Code::BlockedByPlaceInWave).with("in_flight", rollout.in_flight))
+}
+
+/// The area whose rules hold for a robot that changes to something new: where it is, or was seen last. Who goes back asks no rules.
+pub(super) fn area_ahead(view: &View, board: &Board, rollout: &Rollout, r: &RolloutRobot) -> Option<AreaId> {
+    let here = || board.get(&r.robot_id).and_then(|live| view.area_of(live));
+    let seen = || view.software.get(r.robot_id.as_str()).and_then(|s| s.row.area.clone());
+    if rollout.revert_of.is_some() { None } else { here().or_else(seen) }
+}
+
+/// The area of the robot, if no new drain may begin there.
+fn shut(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<AreaId> {
+    area_ahead(view, board, rollout, r).filter(|area| !view.policy(area).software.is_open(now))
 }
 
 /// Why a roll-out stands still, as words.
@@ -280,12 +302,18 @@ pub fn in_flight_max(view: &View, rollout: &Rollout) -> u32 {
     rollout.spec.max_in_flight.map_or(wave, |most| most.min(wave)).max(1)
 }
 
-fn draining(view: &View, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
+/// Fleet was asked to take it out of work, and its drain has not begun.
+pub(super) fn is_asked(view: &View, r: &RolloutRobot) -> bool {
+    let waits = |id| view.drain(id).is_none_or(|drain| drain.state == DrainState::Waiting);
+    r.step == Step::Draining && r.drain_id.as_ref().is_some_and(waits)
+}
+
+fn draining(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
     let drain_id = r.drain_id.as_ref()?;
     if view.is_held(&r.robot_id, drain_id) || (view.bugs.any_drain_will_do() && view.is_held_by_any(&r.robot_id)) {
         return Some(Move::Held);
     }
-    if stands_still(view, rollout, r) {
+    if stands_still(view, board, rollout, r) || (is_asked(view, r) && shut(view, board, now, rollout, r).is_some()) {
         return Some(Move::LeaveDrain(Step::Staged));
     }
     let drain = view.drain(drain_id)?;
@@ -302,10 +330,11 @@ fn draining(view: &View, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Opti
     }
 }
 
-/// No robot of it gets permission now.
-fn stands_still(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
+/// It gets no permission now: the roll-out stands still, or somebody has frozen its area. A window that shuts lets what has begun end.
+fn stands_still(view: &View, board: &Board, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    let frozen = || area_ahead(view, board, rollout, r).is_some_and(|area| view.policy(&area).software.frozen);
     let stands = left_out(view, rollout, r).is_some() || !rollout.pauses.is_empty() || is_keyless(view, rollout);
-    stands && !view.bugs.pause_is_forgotten()
+    (stands || frozen()) && !view.bugs.pause_is_forgotten()
 }
 
 /// Nobody can sign what its robots take, whatever its phase: newcomers of one that is completed wait too. Who goes back was told already
@@ -346,7 +375,7 @@ fn activating(
     }
     match &r.grant {
         Some(given) => unused(view, board, now, r, given, state).or_else(|| lost(view, board, now, rollout, r)),
-        None if stands_still(view, rollout, r) || (!is_on(rollout, r) && !view.bugs.pause_is_forgotten()) => {
+        None if stands_still(view, board, rollout, r) || (!is_on(rollout, r) && !view.bugs.pause_is_forgotten()) => {
             Some(Move::LeaveDrain(Step::Staged))
         }
         None if r.ready && may_grant(view, board, now, r) => Some(Move::Grant),

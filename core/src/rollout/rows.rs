@@ -4,7 +4,7 @@
 use super::spec::RolloutSpec;
 use super::stamp::Stamp;
 use crate::authority::Authority;
-use crate::gates::{FailureEvidence, OutcomeEvidence, Suspicion, TaskTally};
+use crate::gates::{Effort, Efforts, FailureEvidence, OutcomeEvidence, Suspicion, TaskTally};
 use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId};
 use crate::reason::Reason;
 use crate::rows::{Index, Record, Seq, Table};
@@ -58,6 +58,10 @@ pub struct Bundle {
     pub manifest_length: u64,
     /// Bytes of all components.
     pub length: u64,
+    /// Bytes that a robot needs free beside the two sets that it keeps: all components, the file of the longest as it comes over the wire, which
+    /// is at most as long, and a new base once more, in its slot. 0: it was published before that was kept.
+    #[serde(default)]
+    pub room: u64,
     /// Models that every component runs on.
     pub hardware: BTreeSet<String>,
     /// What a robot must do to change to it: `none`, `restart`, `park`, `reboot`.
@@ -71,6 +75,9 @@ pub struct Bundle {
     /// Components that its own need beside them, and their lowest versions.
     #[serde(default)]
     pub requires: BTreeMap<String, String>,
+    /// The lowest `rollback_index` of its components. None: it was published before that was kept.
+    #[serde(default)]
+    pub rollback_index: Option<u64>,
     /// The newest release lists it.
     pub listed: bool,
     /// A person took it back.
@@ -256,6 +263,9 @@ pub struct Verdict {
     pub tasks: FailureEvidence,
     /// What follows from the tasks; it ends a roll-out only if its spec or the rules of an area say so.
     pub suspicion: Suspicion,
+    /// What work cost them, beside that of the others.
+    #[serde(default)]
+    pub efforts: Efforts,
     /// UTC, site clock.
     pub at: Utc,
     /// Who, if it was a person.
@@ -291,6 +301,9 @@ pub struct Counted {
     pub trial: BTreeMap<RobotId, TaskTally>,
     /// All that had ended with any other version by then, since ever.
     pub control: TaskTally,
+    /// What work had cost robots with any other version when the roll-out began, since ever.
+    #[serde(default)]
+    pub effort: Effort,
 }
 
 /// One roll-out.
@@ -311,7 +324,7 @@ pub struct Rollout {
     pub version: u64,
     /// Rises with each pause, resume and abort: permissions of an older one are not given any more.
     pub generation: u64,
-    /// Robots that are out of work for it: drains that were not released.
+    /// Robots that are out of work for it: drains that were not released, but for those of robots that were written off.
     pub in_flight: u32,
     /// The wave is only watched until then.
     pub soak: Option<Countdown>,
@@ -337,6 +350,9 @@ pub struct Rollout {
     pub tasks: FailureEvidence,
     /// Up to where tasks were counted for that.
     pub counted: Arc<Counted>,
+    /// What work cost its robots and the others when tasks were counted last.
+    #[serde(default)]
+    pub efforts: Efforts,
     /// Who wrote it down.
     pub created: Act,
     /// Who stands for it.
@@ -488,6 +504,15 @@ impl WayBack {
     }
 }
 
+/// A robot that is out of work for a roll-out and was not heard for longer than the roll-out bears.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Lost {
+    /// UTC, site clock, when a person was told.
+    pub since: Utc,
+    /// Who said that it counts in no budget until it is heard. None: nobody did.
+    pub written_off: Option<Act>,
+}
+
 /// One robot in one roll-out.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RolloutRobot {
@@ -531,11 +556,21 @@ pub struct RolloutRobot {
     pub again: bool,
     /// Tasks it had ended with this version when its trial began.
     pub before: TaskTally,
+    /// What work had cost it with this version by then.
+    #[serde(default)]
+    pub effort_before: Effort,
     /// When what happened.
     pub moments: Moments,
+    /// It is lost. None: it is heard, or has not been silent for long.
+    #[serde(default)]
+    pub lost: Option<Lost>,
 }
 
 impl RolloutRobot {
+    /// Its drain counts among the robots that are out of work.
+    pub fn counts(&self) -> bool {
+        self.lost.as_ref().is_none_or(|lost| lost.written_off.is_none())
+    }
     /// It was given no permission, or was seen to have left the last one unused.
     pub const fn never_ran(&self) -> bool {
         !self.attempted || (self.not_used && self.moments.switched.is_none())

@@ -2,6 +2,7 @@
 //!
 //! Invariant: a checked spec never changes; what a roll-out does afterwards is in its row.
 
+use crate::gates::EffortLimits;
 use crate::ids::{AreaId, BundleId, RobotId};
 use crate::reason::Violations;
 use serde::{Deserialize, Serialize};
@@ -20,6 +21,16 @@ pub const PROBATION_DEFAULT_MS: u64 = 180_000;
 const COMPLETE_PERCENT_DEFAULT: u32 = 90;
 /// Probation, milliseconds of site time.
 const PROBATION_MS: RangeInclusive<u64> = 1_000..=24 * 3_600_000;
+
+/// Silence after which a robot out of work is lost, milliseconds of link time.
+const LOST_AFTER_MS: RangeInclusive<u64> = 60_000..=30 * 24 * 3_600_000;
+/// As much where a spec says nothing, milliseconds of link time: long after the gates have judged what is theirs.
+const fn lost_after_ms() -> u64 {
+    900_000
+}
+
+/// A limit of effort above this is none.
+const EFFORT_MAX: u32 = 10_000;
 
 /// Whom a roll-out is for. Everything that is named must hold; what is empty holds for all.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -127,6 +138,18 @@ pub struct RolloutSpec {
     /// So many of a hundred robots that were offered the bundle must have it at the end, or the outcome is INCOMPLETE. 1..100.
     #[serde(default = "complete_percent_default")]
     pub complete_percent: u32,
+    /// Milliseconds of link time after which a robot that is out of work for it and is not heard is lost: an incident.
+    #[serde(default = "lost_after_ms")]
+    pub lost_after_ms: u64,
+    /// A robot that is lost counts in no budget until it is heard. Else a person has to say so.
+    #[serde(default)]
+    pub writes_off_lost: bool,
+    /// No component of the bundle may have a lower `rollback_index`: each robot holds it against what it is given. Whoever goes back does not.
+    #[serde(default)]
+    pub rollback_floor: u64,
+    /// What its robots' work may cost more than that of the others.
+    #[serde(default)]
+    pub effort: EffortLimits,
 }
 
 /// The share of roll-outs that were written down before there was one.
@@ -154,6 +177,10 @@ impl RolloutSpec {
             rate_bytes_s: 0,
             acts_on_rates: false,
             complete_percent: COMPLETE_PERCENT_DEFAULT,
+            lost_after_ms: lost_after_ms(),
+            writes_off_lost: false,
+            rollback_floor: 0,
+            effort: EffortLimits::default(),
         }
     }
 
@@ -185,8 +212,19 @@ impl RolloutSpec {
         within("probation_ms", self.probation_ms, &PROBATION_MS);
         within("soak_ms", self.soak_ms, &(0..=*LIMIT_MS.end()));
         within("exposure_within_ms", self.exposure_within_ms, &LIMIT_MS);
+        within("lost_after_ms", self.lost_after_ms, &LOST_AFTER_MS);
         if self.exposure_tasks > 10_000 {
             bad.add("exposure_tasks", "must be at most 10000");
+        }
+        let effort = [
+            ("slower_permille", self.effort.slower_permille),
+            ("energy_permille", self.effort.energy_permille),
+            ("hotter_decidegrees", self.effort.hotter_decidegrees),
+        ];
+        for (field, limit) in effort {
+            if limit.is_some_and(|limit| limit > EFFORT_MAX) {
+                bad.add(format!("effort.{field}"), format!("must be at most {EFFORT_MAX}"));
+            }
         }
         if self.max_in_flight == Some(0) {
             bad.add("max_in_flight", "must be at least 1");
@@ -241,6 +279,8 @@ mod tests {
             max_in_flight: Some(0),
             exposure_tasks: 10_001,
             complete_percent: 0,
+            lost_after_ms: 59_999,
+            effort: EffortLimits { energy_permille: Some(10_001), ..EffortLimits::default() },
             ..spec()
         };
         let expected = [
@@ -250,7 +290,9 @@ mod tests {
             "waves[3]",
             "drain_within_ms",
             "probation_ms",
+            "lost_after_ms",
             "exposure_tasks",
+            "effort.energy_permille",
             "max_in_flight",
             "complete_percent",
         ];

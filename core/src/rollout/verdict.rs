@@ -8,7 +8,7 @@ use super::rows::{Abort, Counted, Outcome, Rollout, RolloutRobot, Step, Verdict}
 use super::spec::{SmallWave, SmallWaveFailure};
 use super::stamp::Stamp;
 use super::view::View;
-use super::{Board, Tx};
+use super::{Board, Tx, effort};
 use crate::fleet::heard;
 use crate::fleet::rows::RobotCounter;
 use crate::gates::{self, FEW_ROBOTS, RobotOutcomes, Suspicion, TaskTally};
@@ -81,8 +81,9 @@ pub fn count_tasks(tx: &mut Tx, id: &RolloutId) {
     let news = trial.iter().map(|(id, tally)| (id.clone(), since(*tally, before(id)))).collect();
     let mut tasks = rollout.tasks.clone();
     tasks.observe(&news, since(control, rollout.counted.control));
-    let counted = Arc::new(Counted { at_ms, trial, control });
-    let row = Rollout { tasks, counted, ..rollout.clone() };
+    let counted = Arc::new(Counted { at_ms, trial, control, effort: rollout.counted.effort });
+    let efforts = effort::seen(tx.view, rollout);
+    let row = Rollout { tasks, counted, efforts, ..rollout.clone() };
     tx.put(row, "rollout.tasks_counted");
 }
 
@@ -129,6 +130,7 @@ pub fn of(rollout: &Rollout, seen: &Seen, outcome: Outcome, reason: Reason, at: 
         robots,
         tasks: rollout.tasks.clone(),
         suspicion: rollout.tasks.suspicion(),
+        efforts: rollout.efforts,
         at,
         actor: None,
     }
@@ -237,8 +239,19 @@ pub fn wave<'a>(view: &'a View, id: &RolloutId, wave: u32) -> impl Iterator<Item
     view.robots_of(id).filter(move |r| r.wave == wave)
 }
 
-/// What the gate after a wave says.
+/// What the gate after a wave says. What would go on waits for a person where its robots' work costs more than its spec lets pass.
 pub fn gate(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Verdict {
+    let rollout = &Rollout { efforts: effort::seen(view, rollout), ..rollout.clone() };
+    let verdict = judge(view, board, now, rollout);
+    let goes_on =
+        matches!(verdict.outcome, Outcome::Promoted | Outcome::PromotedUnproven) && rollout.revert_of.is_none();
+    match effort::excess(&rollout.efforts, &rollout.spec.effort).filter(|_| goes_on) {
+        Some(reason) => Verdict { outcome: Outcome::Review, reason, ..verdict },
+        None => verdict,
+    }
+}
+
+fn judge(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Verdict {
     let seen = see_wave(view, board, now, rollout);
     let give = |outcome, code: Code| of(rollout, &seen, outcome, code.into(), now.utc);
     if rollout.revert_of.is_some() {

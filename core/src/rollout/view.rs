@@ -10,7 +10,7 @@ use super::rows::{
 };
 use crate::fleet::Board;
 use crate::fleet::heard;
-use crate::fleet::rows::{Drain, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
+use crate::fleet::rows::{AreaBudget, Drain, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
 use crate::ids::{AreaId, DrainId, RobotId, RolloutId};
 use crate::limits;
 use crate::maintenance::{DrainRelease, DrainRequest};
@@ -58,6 +58,8 @@ pub struct View {
     pub command_keys: Slot<CommandKey>,
     /// Drains (fleet's).
     pub drains: Slot<Drain>,
+    /// Who of an area is out of work (fleet's).
+    pub budgets: Slot<AreaBudget>,
     /// Robots' mutexes (fleet's).
     pub authority: Slot<RobotAuthority>,
     /// Cordons, breakers, retired robots (fleet's).
@@ -138,6 +140,7 @@ viewed! {
     OtaClock => clocks;
     CommandKey => command_keys;
     Drain => drains;
+    AreaBudget => budgets;
     RobotAuthority => authority;
     RobotCounter => counters;
     AreaPolicy => policies;
@@ -253,6 +256,7 @@ pub const WHOLE: &[Table] = &[
     Table::OtaMark,
     Table::OtaClock,
     Table::Drain,
+    Table::AreaBudget,
     Table::RobotAuthority,
     Table::RobotControl,
     Table::RobotCounter,
@@ -279,6 +283,7 @@ impl View {
             clocks: Slot::new(),
             command_keys: Slot::new(),
             drains: Slot::new(),
+            budgets: Slot::new(),
             authority: Slot::new(),
             control: Slot::new(),
             counters: Slot::new(),
@@ -346,6 +351,7 @@ impl View {
             OtaClock => OtaClock,
             OtaCommandKey => CommandKey,
             Drain => Drain,
+            AreaBudget => AreaBudget,
             RobotAuthority => RobotAuthority,
             RobotControl => RobotControl,
             RobotCounter => RobotCounter,

@@ -242,7 +242,8 @@ impl RawTask {
     }
 }
 
-fn check_labels(labels: &BTreeMap<String, String>, field: &str, bad: &mut Violations) {
+/// Notes every rule that labels break, under `field`.
+pub fn check_labels(labels: &BTreeMap<String, String>, field: &str, bad: &mut Violations) {
     if labels.len() > limits::LABELS_MAX {
         bad.add(field, "must be at most 32 entries");
     }

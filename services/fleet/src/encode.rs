@@ -56,6 +56,7 @@ pub fn control(view: &View, board: &Board, robot_id: &RobotId) -> v1::RobotContr
             actor: word.actor.clone(),
             is_told: word.is_told,
         }),
+        labels: row.labels,
         etag: etag(rowed.map_or(Revision(0), |c| c.revision)),
         drain: drain(view, robot_id),
         work_generation: view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation),

@@ -128,6 +128,14 @@ impl FleetService {
         Ok(v1::SettleRobotLoadResponse { control })
     }
 
+    async fn label(&self, r: v1::LabelRobotRequest, by: &Caller) -> Result<v1::LabelRobotResponse, Refusal> {
+        let (robot_id, request_id) = robot_and_request(&r.robot_id, &r.request_id, None, Violations::default())?;
+        let removed = r.removed.into_iter().collect();
+        let command = Command::Label { robot_id: robot_id.clone(), labels: r.labels, removed };
+        let control = self.act_on_robot(robot_id, command, by, &r.etag, r.validate_only, request_id).await?;
+        Ok(v1::LabelRobotResponse { control })
+    }
+
     async fn drain(&self, r: v1::DrainRobotRequest, by: &Caller) -> Result<v1::DrainRobotResponse, Refusal> {
         let mut bad = Violations::default();
         let within_ms = parse_ms(r.within.as_ref(), At::top("within"), &mut bad).unwrap_or(DRAIN_WITHIN_MS);
@@ -445,6 +453,10 @@ impl Face for FleetService {
     ) -> Result<Response<v1::SettleRobotLoadResponse>, Status> {
         let by = caller(&r);
         answer(self.settle_load(r.into_inner(), &by).await)
+    }
+    async fn label_robot(&self, r: Request<v1::LabelRobotRequest>) -> Result<Response<v1::LabelRobotResponse>, Status> {
+        let by = caller(&r);
+        answer(self.label(r.into_inner(), &by).await)
     }
     async fn get_area_policy(
         &self,

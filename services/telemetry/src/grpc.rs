@@ -112,10 +112,9 @@ fn admits(inner: &Inner, filter: &Filter, robot_id: &RobotId) -> bool {
     }
     let rows = inner.picture.rows();
     let presence = shown_presence(rows.presence.get(robot_id), inner.parts.board.get(robot_id).as_deref());
-    let labels = rows.sessions.get(robot_id).map(|s| &s.inventory.labels);
     (filter.robot_ids.is_empty() || filter.robot_ids.contains(robot_id.as_str()))
         && (filter.presences.is_empty() || filter.presences.contains(&presence))
-        && filter.labels.iter().all(|(k, v)| labels.is_some_and(|l| l.get(k) == Some(v)))
+        && filter.labels.iter().all(|(key, value)| rows.label(robot_id, key) == Some(value.as_str()))
 }
 
 impl TelemetryService {

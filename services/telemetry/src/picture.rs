@@ -4,7 +4,7 @@
 
 use crate::Inner;
 use crate::stops::SiteStops;
-use midshift_core::fleet::rows::SiteRow;
+use midshift_core::fleet::rows::{RobotControl, SiteRow};
 use midshift_core::ids::{AreaId, RobotId, StopId, WaypointId};
 use midshift_core::rows::{BadRow, Seq, Table};
 use midshift_core::site::{Site, text};
@@ -39,6 +39,8 @@ pub struct Sections {
 pub struct Rows {
     /// Newest sessions.
     pub sessions: BTreeMap<RobotId, Session>,
+    /// What people decided about robots; here for the labels that they gave.
+    pub control: BTreeMap<RobotId, RobotControl>,
     /// Presence.
     pub presence: BTreeMap<RobotId, PresenceRow>,
     /// Durable numbers, by row id.
@@ -52,6 +54,10 @@ pub struct Rows {
 }
 
 impl Rows {
+    /// A label of a robot: what people said, or else what it says itself.
+    pub fn label(&self, robot_id: &RobotId, key: &str) -> Option<&str> {
+        RobotControl::label(self.control.get(robot_id), &self.sessions.get(robot_id)?.inventory, key)
+    }
     /// The area in which a robot is by its newest heartbeat; none: not known.
     pub fn area_of(&self, live: Option<&Live>) -> Option<&AreaId> {
         live?.area(self.site.as_ref()?)
@@ -160,6 +166,7 @@ impl Fold for Keeper {
             Table::DesiredPolicy,
             Table::DesiredUpdate,
             Table::Session,
+            Table::RobotControl,
             Table::Presence,
             Table::LaneMark,
             Table::Site,
@@ -197,6 +204,7 @@ impl Fold for Keeper {
                 sections(&mut rows, &robot_id).update = self.left_out.read_change(&change)?.map(Arc::new)
             }
             Table::Session => put(&mut rows.sessions, robot_id.clone(), self.left_out.read_change(&change)?),
+            Table::RobotControl => put(&mut rows.control, robot_id.clone(), self.left_out.read_change(&change)?),
             Table::Presence => put(&mut rows.presence, robot_id.clone(), self.left_out.read_change(&change)?),
             Table::LaneMark => put(&mut rows.marks, id, self.left_out.read_change(&change)?),
             _ => {}

@@ -25,7 +25,8 @@ pub fn run(directives: usize, rounds: usize) -> anyhow::Result<Vec<Figure>> {
     for _ in 0..rounds {
         whole.push(per_s(&robots, |robot_id| {
             let (bundle, rollout_id) = (&bundle, &rollout_id);
-            let order = Order { robot_id, generation: 1, bundle, manifest_length: 1_000, rollout_id, issued_at };
+            let (generation, manifest_length, rollback_floor) = (1, 1_000, 0);
+            let order = Order { robot_id, generation, bundle, manifest_length, rollback_floor, rollout_id, issued_at };
             black_box(signer.directive(&order).len());
         }));
         bare.push(per_s(&robots, |_| {

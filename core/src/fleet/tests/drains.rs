@@ -40,6 +40,8 @@ fn drains_that_are_asked_for_and_let_go_all_at_once_are_decided_in_slices() {
             within_ms: 600_000,
             urgent: false,
             returns: false,
+            forward: false,
+            written_off: false,
         });
     }
     assert!(take_turns(&mut rig) > 3);

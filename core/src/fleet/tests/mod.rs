@@ -4,6 +4,7 @@ mod backlog;
 mod drains;
 mod energy;
 mod incidents;
+mod labels;
 mod lasting;
 mod maps;
 mod order;

@@ -191,6 +191,8 @@ impl Rig {
         } else {
             *row.failures.entry(7).or_default() += 1;
         }
+        let energy_mwh = if self.robots[n].version == "0.9.0" { 10 } else { self.trial_energy_mwh };
+        row.stats += WorkStats { path_mm: 50_000, duration_ms: 20_000, energy_mwh, ..WorkStats::default() };
         self.put(row);
     }
 }

@@ -8,8 +8,10 @@ mod agents;
 mod asks;
 mod drains_and_grants;
 mod endings;
+mod held_back;
 mod jams;
 mod keyless;
+mod lost;
 mod named;
 mod newcomers_and_pins;
 mod once;
@@ -148,6 +150,8 @@ struct Rig {
     robots: Vec<Robot>,
     /// Robots on trial end a task each second.
     works: bool,
+    /// What a task costs a robot with a new version, milliwatt-hours. With the old one it is 10.
+    trial_energy_mwh: u64,
     /// Fleet does nothing.
     fleet_sleeps: bool,
     /// The service has no key that robots know.
@@ -173,6 +177,7 @@ impl Rig {
             heard: BTreeSet::new(),
             robots: Vec::new(),
             works: true,
+            trial_energy_mwh: 10,
             fleet_sleeps: false,
             keyless: false,
             checks_rebuild: true,
@@ -412,6 +417,12 @@ impl Rig {
     }
 
     fn fleet_turn(&mut self) {
+        let items = self.fleet_plan();
+        self.commit(items);
+    }
+
+    /// What fleet decides, before it is committed.
+    fn fleet_plan(&mut self) -> Vec<Item> {
         let mut plan = fleet::Plan::default();
         let entries = self.feed[self.fleet_at..].to_vec();
         self.fleet_at = self.feed.len();
@@ -424,7 +435,7 @@ impl Rig {
         drain::obey(&mut self.fleet, self.now, &mut plan);
         budget::plan(&mut self.fleet, &self.board, self.now, &mut plan);
         drain::plan(&mut self.fleet, &self.board, self.now, &mut plan);
-        self.commit(plan.items);
+        plan.items
     }
 
     /// The service dies and reads everything again.
@@ -474,7 +485,13 @@ impl Rig {
         for rollout in self.ota.rollouts.values().map(|r| &r.row) {
             let drains: Vec<&DrainId> =
                 self.ota.robots_of(&rollout.rollout_id).filter_map(|r| r.drain_id.as_ref()).collect();
-            assert_eq!(rollout.in_flight as usize, drains.len(), "in flight");
+            let counted = self.ota.robots_of(&rollout.rollout_id).filter(|r| r.drain_id.is_some() && r.counts());
+            assert_eq!(rollout.in_flight as usize, counted.count(), "in flight");
+            for r in self.ota.robots_of(&rollout.rollout_id) {
+                let waits = super::explain::blocked(&self.ota, &self.board, &self.now, rollout, r);
+                let until = waits.as_ref().and_then(|waits| waits.deadline);
+                assert!(until.is_none_or(|until| until > self.now.utc), "{} waits for the past: {waits:?}", r.robot_id);
+            }
             for drain_id in drains {
                 assert!(self.ota.requests.contains_key(drain_id.as_str()), "a drain without a request");
                 assert!(!self.ota.releases.contains_key(drain_id.as_str()), "a drain that was released");
@@ -515,12 +532,14 @@ fn bundle(n: u32) -> Bundle {
         version: format!("{n}.0.0"),
         manifest_length: 100,
         length: 1_000,
+        room: 1_200,
         hardware: BTreeSet::from(["m1".to_owned()]),
         needs: "restart".into(),
         hard_stop_codes: BTreeSet::from([66]),
         is_irreversible: false,
         has_base: false,
         requires: BTreeMap::new(),
+        rollback_index: Some(4),
         listed: true,
         revoked: None,
         published: Utc(BEGIN),

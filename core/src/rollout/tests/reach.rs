@@ -113,6 +113,21 @@ fn a_person_does_not_approve_by_one_token_what_it_wrote_by_another() {
 }
 
 #[test]
+fn a_full_push_is_a_right_of_its_own_in_each_area_that_it_is_for() {
+    let mut rig = Rig::rooms();
+    let push = |id: &str| {
+        let Command::Create { rollout_id, spec } = create(id, &["hall"]) else { panic!("it creates") };
+        let spec = RolloutSpec { waves: vec![Wave::Rest], allow_full_push: true, ..RolloutSpec::clone(&spec) };
+        Command::Create { rollout_id, spec: Arc::new(spec) }
+    };
+    assert_eq!(rig.by(&holder("anna", &["ota-author"]), &push("a")), DENIED);
+    assert_eq!(rig.by(&holder("anna", &["ota-author", "ota-full-push@quality"]), &push("a")), DENIED);
+    assert_eq!(rig.by(&holder("ben", &["ota-full-push"]), &push("a")), DENIED, "nor is it to write one");
+    assert_eq!(rig.by(&holder("carl", &["ota-author", "ota-full-push@hall"]), &push("a")), Ok(()));
+    assert_eq!(rig.by(&holder("anna", &["ota-author"]), &create("b", &["hall"])), Ok(()), "waves need no more");
+}
+
+#[test]
 fn a_roll_out_is_for_whoever_may_in_all_areas_that_it_is_for() {
     let mut rig = Rig::rooms();
     let anna = holder("anna", &["ota-author@hall", "viewer@quality"]);

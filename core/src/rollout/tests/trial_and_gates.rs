@@ -2,6 +2,7 @@
 
 use super::super::rows::Verdict;
 use super::*;
+use crate::gates::EffortLimits;
 
 fn verdicts(rig: &Rig) -> Vec<(Outcome, Code, u32)> {
     let all = rig.rollout("ro").verdicts;
@@ -36,6 +37,34 @@ fn a_wave_that_proves_nothing_is_asked_about_if_the_spec_says_so() {
     rig.until(100, |r| r.phase() == Phase::Completed);
     let promoted = rig.rollout("ro").verdicts.into_iter().filter(|v| v.outcome == Outcome::PromotedByPerson);
     assert!(promoted.inspect(|v| assert_eq!(v.actor.as_deref(), Some("ana"))).count() == 2);
+}
+
+#[test]
+fn work_that_costs_more_than_is_let_pass_is_a_persons_to_judge_and_else_only_shown() {
+    let limits = EffortLimits { energy_permille: Some(200), ..EffortLimits::default() };
+    let unproven = (Outcome::PromotedUnproven, Code::GateUnproven);
+    let too_high = (Outcome::Review, Code::EffortTooHigh);
+    for (energy_mwh, effort, expected) in
+        [(12, limits, unproven), (13, limits, too_high), (13, EffortLimits::default(), unproven)]
+    {
+        let mut rig = Rig::new(4);
+        rig.trial_energy_mwh = energy_mwh;
+        rig.start(RolloutSpec { effort, ..spec() });
+        let first = rig.order()[0];
+        for _ in 0..200 {
+            if !rig.rollout("ro").verdicts.is_empty() {
+                break;
+            }
+            rig.tick();
+            (0..4).filter(|n| *n != first).for_each(|n| rig.ends_task(n, true));
+        }
+        let rollout = rig.rollout("ro");
+        let verdict = rollout.verdicts.first().expect("it was judged");
+        assert_eq!((verdict.outcome, verdict.reason.code), expected, "{energy_mwh}");
+        let efforts = verdict.efforts;
+        assert_eq!((efforts.trial.mwh_a_km(), efforts.control.mwh_a_km()), (Some(energy_mwh * 20), Some(200)));
+        assert_eq!((efforts.trial.ms_a_task(), efforts.control.ms_a_task()), (Some(20_000), Some(20_000)));
+    }
 }
 
 #[test]

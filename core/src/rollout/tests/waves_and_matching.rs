@@ -77,6 +77,45 @@ fn a_budget_that_lets_nobody_out_is_told_at_once_and_only_to_whom_it_concerns() 
     assert!(dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &tow).is_ok(), "no robot that lifts is reached");
 }
 
+/// Keeps the floors that it was to sign.
+struct Floors(std::cell::RefCell<Vec<u64>>);
+
+impl Sign for Floors {
+    fn directive(&self, order: &Order) -> String {
+        self.0.borrow_mut().push(order.rollback_floor);
+        Plain.directive(order)
+    }
+}
+
+#[test]
+fn the_floor_that_is_asked_for_is_signed_and_one_above_the_bundle_is_refused() {
+    let mut rig = Rig::new(3);
+    let above = RolloutSpec { rollback_floor: 5, ..spec() };
+    let refused = dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &above).expect_err("the bundle has 4");
+    assert_eq!(refused.violations.iter().map(|v| v.field.as_str()).collect::<Vec<_>>(), ["rollback_floor"]);
+    let create = Command::Create { rollout_id: rollout_id("no"), spec: Arc::new(above) };
+    assert!(rig.ask(&create).is_err(), "it is not even written down");
+    rig.keyless = true;
+    rig.start(RolloutSpec { rollback_floor: 4, ..spec() });
+    rig.pass(1_000);
+    let (floors, heard, mut plan) = (Floors(Vec::new().into()), std::mem::take(&mut rig.heard), Plan::default());
+    cycle(&mut rig.ota, rig.now, &rig.board, &heard, Ok(&floors), &mut plan);
+    assert_eq!(floors.0.into_inner(), [4, 4, 4]);
+}
+
+#[test]
+fn a_label_of_a_person_goes_before_the_robots_own_in_selectors_and_waves() {
+    let mut rig = Rig::new(4);
+    rig.control(0, |c| drop(c.labels.insert("line".into(), "odd".into())));
+    rig.tick();
+    let odd = Wave::Label { key: "line".into(), value: "odd".into() };
+    assert_eq!(sizes(&rig, vec![odd, Wave::Rest]), [3, 1], "two say so of themselves");
+    let mut selected = RolloutSpec { waves: vec![Wave::Count(1), Wave::Rest], ..spec() };
+    selected.selector.labels.insert("line".into(), "odd".into());
+    let run = dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &selected).expect("it may run");
+    assert!(run.matching.robots.iter().any(|m| m.robot_id == robot_id(0)), "{:?}", run.matching.robots);
+}
+
 #[test]
 fn who_is_left_out_is_told_with_the_reason() {
     let mut rig = Rig::new(6);
@@ -97,7 +136,7 @@ fn who_is_left_out_is_told_with_the_reason() {
 fn a_dry_run_tells_who_has_too_little_room_and_who_lacks_what_the_bundle_needs() {
     let mut rig = Rig::new(4);
     rig.put(Bundle { requires: [("map".to_owned(), "1.2.0".to_owned())].into(), ..bundle(2) });
-    for (n, free_bytes, map) in [(0, 999, Some("1.2.0")), (1, 1_000, Some("1.1.9")), (2, u64::MAX, None)] {
+    for (n, free_bytes, map) in [(0, 1_199, Some("1.2.0")), (1, 1_200, Some("1.1.9")), (2, u64::MAX, None)] {
         let session = rig.row::<Session>(robot_id(n).as_str()).expect("it attached");
         rig.put(Session { installed: Some(installed(n, free_bytes, map)), ..session });
     }

@@ -17,6 +17,7 @@ use midshift_proto::fleet::v1 as fleet;
 use midshift_proto::json;
 use midshift_proto::ota::v1 as ota;
 use midshift_proto::telemetry::v1;
+use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::time::Duration;
 
@@ -135,6 +136,19 @@ pub enum Verb {
         #[command(flatten)]
         change: Change,
     },
+    /// Give it labels that go before what it says itself, or take such labels back.
+    Label {
+        #[command(flatten)]
+        one: One,
+        /// KEY=VALUE gives one, KEY- takes one back.
+        #[arg(required = true)]
+        labels: Vec<String>,
+        /// Only if it is still as this etag says.
+        #[arg(long, default_value = "")]
+        if_match: String,
+        #[command(flatten)]
+        change: Change,
+    },
     /// Keep it at the software that it runs.
     Pin {
         #[command(flatten)]
@@ -226,7 +240,7 @@ impl Verb {
             Self::Cordon { one, .. } | Self::Uncordon { one, .. } | Self::Drain { one, .. } => Some(one),
             Self::Undrain { one, .. } | Self::Retire { one, .. } | Self::Disown { one, .. } => Some(one),
             Self::Pin { one, .. } | Self::Unpin { one, .. } | Self::Exclude { one, .. } => Some(one),
-            Self::Load { one, .. } | Self::Unstick { one, .. } => Some(one),
+            Self::Load { one, .. } | Self::Unstick { one, .. } | Self::Label { one, .. } => Some(one),
             // A robot that is enrolled needs not have been heard.
             Self::Revoke(_) | Self::Enroll(_) | Self::Replace { .. } | Self::Adopt { .. } => None,
             Self::Ls { .. } | Self::Watch { .. } | Self::Identities { .. } => None,
@@ -368,6 +382,20 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
             }
             Ok(())
         }
+        Verb::Label { one, labels, if_match, change } => {
+            let (labels, removed) = relabeling(&labels)?;
+            let request = fleet::LabelRobotRequest {
+                robot_id: one.robot_id,
+                request_id: change.request_id,
+                etag: if_match,
+                labels,
+                removed,
+                validate_only: change.dry_run,
+            };
+            let answer = one.call.fleet().await?.label_robot(unary(request)).await.map_err(Exit::with_facts)?;
+            control(&answer.into_inner().control.unwrap_or_default(), out)?;
+            Ok(())
+        }
         Verb::Pin { one, reason, change } => {
             let only = change.only();
             let request = ota::PinRobotRequest {
@@ -416,6 +444,23 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
     }
 }
 
+/// Labels that are given, and keys of those that are taken back.
+fn relabeling(words: &[String]) -> Result<(BTreeMap<String, String>, Vec<String>), Exit> {
+    let (mut labels, mut removed) = (BTreeMap::new(), Vec::new());
+    for word in words {
+        match (word.split_once('='), word.strip_suffix('-')) {
+            (Some((key, value)), _) => {
+                labels.insert(key.to_owned(), value.to_owned());
+            }
+            (None, Some(key)) => removed.push(key.to_owned()),
+            (None, None) => {
+                return Err(Exit::usage(format!("{word} is no label: say KEY=VALUE, or KEY- to take one back")));
+            }
+        }
+    }
+    Ok((labels, removed))
+}
+
 /// What a robot runs, in words.
 fn software(software: &ota::RobotSoftware, out: &Out) -> Result<(), Exit> {
     let short = |bundle: &str| bundle.chars().take(12).collect::<String>();
@@ -453,7 +498,9 @@ fn control_line(control: &fleet::RobotControl) -> String {
         format!("  {is_empty}, says {} ({})", plain(&word.actor), plain(&word.reason))
     };
     let load = control.load_settled.as_ref().map(by_word).unwrap_or_default();
-    format!("{}  {duty}{why}  {holder}{holds}{load}", control.robot_id)
+    let labels: Vec<String> = control.labels.iter().map(|(k, v)| format!("{}={}", plain(k), plain(v))).collect();
+    let labels = if labels.is_empty() { String::new() } else { format!("  labels {}", labels.join(" ")) };
+    format!("{}  {duty}{why}  {holder}{holds}{load}{labels}", control.robot_id)
 }
 
 /// What its launcher says.

@@ -24,7 +24,7 @@ pub enum Verb {
         /// The person who has it: with several tokens a person still approves nothing that it wrote. Without it the name stands for itself.
         #[arg(long, value_name = "NAME")]
         person: Option<String>,
-        /// What it may do, ROLE or ROLE@AREA, more than one apart by commas: viewer, dispatcher, operator, ota-author, ota-approver, stop-only, stop-resetter,
+        /// What it may do, ROLE or ROLE@AREA, more than one apart by commas: viewer, dispatcher, operator, ota-author, ota-approver, ota-full-push, stop-only, stop-resetter,
         /// admin, auditor.
         #[arg(long, value_delimiter = ',', required = true)]
         role: Vec<Grant>,

@@ -1,5 +1,6 @@
 //! What callers ask for, as core's types. Every broken rule of a request is told at once.
 
+use midshift_core::gates::EffortLimits;
 use midshift_core::ids::{AreaId, BundleId, RobotId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::rollout::spec::{RolloutSpec, Selector, Wave};
@@ -44,6 +45,7 @@ pub fn spec(wire: &v1::RolloutSpec, bundle: BundleId, probation_ms: u64, bad: &m
     let probation_ms = ms("probation", &wire.probation, default.probation_ms);
     let soak_ms = ms("soak", &wire.soak, default.soak_ms);
     let exposure_within_ms = ms("exposure_within", &wire.exposure_within, default.exposure_within_ms);
+    let lost_after_ms = ms("lost_after", &wire.lost_after, default.lost_after_ms);
     let waves = if wire.waves.is_empty() { default.waves.clone() } else { waves(&wire.waves, bad) };
     RolloutSpec {
         selector: wire.selector.as_ref().map(|s| selector(s, bad)).unwrap_or_default(),
@@ -61,7 +63,19 @@ pub fn spec(wire: &v1::RolloutSpec, bundle: BundleId, probation_ms: u64, bad: &m
         rate_bytes_s: wire.rate_bytes_s,
         acts_on_rates: wire.acts_on_rates,
         complete_percent: wire.complete_percent.unwrap_or(default.complete_percent),
+        lost_after_ms,
+        writes_off_lost: wire.writes_off_lost,
+        rollback_floor: wire.rollback_floor,
+        effort: wire.effort.map(effort).unwrap_or_default(),
         bundle: default.bundle,
+    }
+}
+
+fn effort(wire: v1::EffortLimits) -> EffortLimits {
+    EffortLimits {
+        slower_permille: wire.slower_permille,
+        energy_permille: wire.energy_permille,
+        hotter_decidegrees: wire.hotter_decidegrees,
     }
 }
 

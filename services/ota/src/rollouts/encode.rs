@@ -1,6 +1,6 @@
 //! Rows as their messages. Nothing is decided here.
 
-use midshift_core::gates::{Suspicion, TaskTally};
+use midshift_core::gates::{Effort, EffortLimits, Suspicion, TaskTally};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::dry_run::DryRun;
 use midshift_core::rollout::explain::blocked;
@@ -71,6 +71,14 @@ fn spec(spec: &RolloutSpec) -> v1::RolloutSpec {
         rate_bytes_s: spec.rate_bytes_s,
         acts_on_rates: spec.acts_on_rates,
         complete_percent: Some(spec.complete_percent),
+        lost_after: Some(duration(spec.lost_after_ms)),
+        writes_off_lost: spec.writes_off_lost,
+        rollback_floor: spec.rollback_floor,
+        effort: (spec.effort != EffortLimits::default()).then_some(v1::EffortLimits {
+            slower_permille: spec.effort.slower_permille,
+            energy_permille: spec.effort.energy_permille,
+            hotter_decidegrees: spec.effort.hotter_decidegrees,
+        }),
     }
 }
 
@@ -94,6 +102,18 @@ fn verdict_of(verdict: &Verdict) -> v1::RolloutVerdict {
         suspicion: suspicion(&verdict.suspicion) as i32,
         time: Some(timestamp(verdict.at)),
         actor: verdict.actor.clone().unwrap_or_default(),
+        trial_effort: Some(effort(&verdict.efforts.trial)),
+        control_effort: Some(effort(&verdict.efforts.control)),
+    }
+}
+
+fn effort(effort: &Effort) -> v1::Effort {
+    v1::Effort {
+        tasks: effort.tasks,
+        duration: Some(duration(effort.duration_ms)),
+        path_mm: effort.path_mm,
+        energy_mwh: effort.energy_mwh,
+        hottest_joint_decidegrees: effort.hottest_joint_decidegrees,
     }
 }
 
@@ -200,6 +220,8 @@ pub fn counted(view: &View, now: &Now, row: &Rollout, counts: Counts) -> v1::Rol
         outcome: row.outcome.map_or(0, WireEnum::to_wire),
         trial: Some(tally(row.tasks.trial)).filter(|tally| *tally != v1::TaskTally::default()),
         control: Some(tally(row.tasks.control)).filter(|tally| *tally != v1::TaskTally::default()),
+        trial_effort: Some(effort(&row.efforts.trial)),
+        control_effort: Some(effort(&row.efforts.control)),
     }
 }
 
@@ -232,6 +254,8 @@ pub fn robot(view: &View, board: &Board, now: &Now, row: &Rollout, r: &RolloutRo
             probation: span(m.switched, m.on_trial),
         }),
         drain_id: text(r.drain_id.as_ref()),
+        lost: r.lost.as_ref().map(|lost| timestamp(lost.since)),
+        written_off: r.lost.as_ref().and_then(|lost| lost.written_off.as_ref()).map(act),
     }
 }
 

@@ -191,6 +191,18 @@ impl RolloutService {
         Ok(v1::ExcludeRobotResponse { rollout: Some(rollout), done_before: done_before(taken) })
     }
 
+    async fn write_off(&self, r: v1::WriteOffRobotRequest, by: &Caller) -> Result<v1::WriteOffRobotResponse, Refusal> {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        required_reason(&r.reason, &mut bad);
+        let request_id = request_id(&r.request_id, &mut bad);
+        bad.finish()?;
+        let about = About { by, rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
+        let verb = Verb::Lost(robot_id.ok_or_else(internal)?);
+        let (rollout, taken) = self.verb_once(about, verb, false, check_only(r.validate_only), request_id).await?;
+        Ok(v1::WriteOffRobotResponse { rollout: Some(rollout), done_before: done_before(taken) })
+    }
+
     async fn roll_back(
         &self,
         r: v1::RollBackRolloutRequest,
@@ -458,6 +470,13 @@ impl Face for RolloutService {
     ) -> Result<Response<v1::ExcludeRobotResponse>, Status> {
         let by = caller(&r);
         answer(self.exclude(r.into_inner(), &by).await)
+    }
+    async fn write_off_robot(
+        &self,
+        r: Request<v1::WriteOffRobotRequest>,
+    ) -> Result<Response<v1::WriteOffRobotResponse>, Status> {
+        let by = caller(&r);
+        answer(self.write_off(r.into_inner(), &by).await)
     }
     async fn roll_back_rollout(
         &self,

@@ -85,17 +85,26 @@ fn fresh(bundle: BundleId, manifest: &Manifest, manifest_length: u64, published:
         version: manifest.version.clone(),
         manifest_length,
         length: manifest.length(),
+        room: room(manifest),
         hardware: manifest.hardware().into_iter().map(str::to_owned).collect(),
         needs: manifest.needs().as_str().to_owned(),
         hard_stop_codes: manifest.hard_stop_codes.clone(),
         is_irreversible: manifest.components.iter().any(|c| c.data_migration == Migration::Irreversible),
         has_base: manifest.components.iter().any(|c| c.kind == ComponentKind::Base),
         requires: required(manifest),
+        rollback_index: manifest.components.iter().map(|c| c.rollback_index).min(),
         listed: true,
         revoked: None,
         published,
         ended: None,
     }
+}
+
+/// Bytes that a robot needs free while it fetches it. A file that comes encoded is there until its component is made of it.
+fn room(manifest: &Manifest) -> u64 {
+    let longest = manifest.components.iter().map(|c| c.length).max().unwrap_or_default();
+    let base = manifest.components.iter().filter(|c| c.kind == ComponentKind::Base).map(|c| c.length);
+    manifest.length().saturating_add(longest).saturating_add(base.sum())
 }
 
 /// What its components need that is not among them. Of two lowest versions the higher counts.
@@ -115,6 +124,19 @@ fn required(manifest: &Manifest) -> BTreeMap<String, String> {
 mod tests {
     use super::*;
     use crate::fixture;
+
+    #[test]
+    fn a_bundle_needs_room_for_its_set_its_longest_file_as_it_comes_and_a_base_in_its_slot() {
+        let (mut manifest, _) = fixture::bundle("walk", "1.0.0");
+        let mut second = manifest.components[0].clone();
+        manifest.components.truncate(1);
+        manifest.components[0].length = 700;
+        (second.name, second.length) = ("walk-arms".to_owned(), 300);
+        manifest.components.push(second);
+        assert_eq!(room(&manifest), 1_000 + 700);
+        manifest.components[1].kind = ComponentKind::Base;
+        assert_eq!(room(&manifest), 1_000 + 700 + 300);
+    }
 
     #[test]
     fn a_bundle_requires_what_its_components_need_and_none_of_them_is() {

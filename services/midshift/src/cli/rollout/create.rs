@@ -68,7 +68,7 @@ pub struct Create {
     /// Who goes back at an abort. Without it all.
     #[arg(long, value_enum)]
     abort_scope: Option<AbortScope>,
-    /// A large first wave, or a single one, is meant so.
+    /// A large first wave, or a single one, is meant so. Where people sign in that needs the role ota-full-push too.
     #[arg(long)]
     allow_full_push: bool,
     /// Bytes a second that each robot may download, e.g. 5MiB. Without it as fast as it goes.
@@ -80,6 +80,24 @@ pub struct Create {
     /// So many percent of the robots that were offered it must have it at the end, or its outcome is INCOMPLETE. Without it 90.
     #[arg(long, value_name = "PERCENT")]
     complete_percent: Option<u32>,
+    /// Time after which a robot that is out of work for it and is not heard is lost, and somebody is told. Without it 15m.
+    #[arg(long, value_parser = crate::cli::duration)]
+    lost_after: Option<Duration>,
+    /// Lost robots count in no budget until they are heard. Without it somebody has to say so: rollout lost.
+    #[arg(long)]
+    write_off_lost: bool,
+    /// No component may have a lower rollback index than this: robots refuse it. Without it 0; each robot holds its own floor beside it.
+    #[arg(long, default_value_t = 0)]
+    rollback_floor: u64,
+    /// A person judges a wave whose robots take so many percent longer for a task than the others. Without it that is only shown.
+    #[arg(long, value_name = "PERCENT")]
+    max_slower: Option<u32>,
+    /// A person judges a wave whose robots need so many percent more energy for a kilometre than the others. Without it that is only shown.
+    #[arg(long, value_name = "PERCENT")]
+    max_energy: Option<u32>,
+    /// A person judges a wave whose joints get so many degrees hotter than those of the others ever were. Without it that is only shown.
+    #[arg(long, value_name = "DEGREES")]
+    max_hotter: Option<u32>,
     /// Only tell what it would do now: whom it reaches, who is left out and why. Nothing is written.
     #[arg(long, conflicts_with_all = ["start", "supersede"])]
     dry_run: bool,
@@ -155,7 +173,22 @@ impl Create {
             rate_bytes_s: self.rate.unwrap_or_default(),
             acts_on_rates: self.acts_on_rates,
             complete_percent: self.complete_percent,
+            lost_after: site(self.lost_after),
+            writes_off_lost: self.write_off_lost,
+            rollback_floor: self.rollback_floor,
+            effort: self.effort(),
         }
+    }
+
+    /// Limits of what work may cost more, if there are any.
+    fn effort(&self) -> Option<v1::EffortLimits> {
+        let tenths = |limit: Option<u32>| limit.map(|limit| limit.saturating_mul(10));
+        let limits = v1::EffortLimits {
+            slower_permille: tenths(self.max_slower),
+            energy_permille: tenths(self.max_energy),
+            hotter_decidegrees: tenths(self.max_hotter),
+        };
+        (limits != v1::EffortLimits::default()).then_some(limits)
     }
 
     /// A refusal, with what to try where the bundle was only guessed.

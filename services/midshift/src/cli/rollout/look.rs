@@ -205,6 +205,10 @@ pub fn explanation(rollout: &v1::Rollout, robot: &v1::RolloutRobot) -> String {
     if !robot.drain_id.is_empty() {
         lines.push(format!("  drain {}", robot.drain_id));
     }
+    lines.extend(robot.lost.as_ref().map(|since| format!("  lost since {}", text::time(Some(since)))));
+    lines.extend(
+        robot.written_off.as_ref().map(|act| format!("  {}", text::act("counts in no budget, written off", act))),
+    );
     let of = rollout.verdicts.iter().filter(|v| v.wave == robot.wave);
     lines.extend(of.map(|v| format!("  {}", text::verdict(v, waves))));
     lines.join("\n")

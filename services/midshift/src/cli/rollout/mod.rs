@@ -78,6 +78,18 @@ pub enum Verb {
         #[command(flatten)]
         change: Change,
     },
+    /// Say that a robot that is lost will not come back: it counts in no budget until it is heard, and keeps its drain.
+    Lost {
+        #[command(flatten)]
+        one: One,
+        /// Whom.
+        robot_id: String,
+        /// Why.
+        #[arg(long)]
+        reason: String,
+        #[command(flatten)]
+        change: Change,
+    },
     /// List roll-outs, the newest first.
     Ls {
         #[command(flatten)]
@@ -141,7 +153,7 @@ impl Verb {
     /// The one roll-out that it is about, and the one robot in it.
     fn named(&mut self) -> (Option<&mut One>, Option<&mut String>) {
         match self {
-            Self::Exclude { one, robot_id, .. } => (Some(one), Some(robot_id)),
+            Self::Exclude { one, robot_id, .. } | Self::Lost { one, robot_id, .. } => (Some(one), Some(robot_id)),
             Self::Explain { one, robot_id } => (Some(one), robot_id.as_mut()),
             Self::Submit(said) | Self::Approve(said) | Self::Pause(said) => (Some(&mut said.one), None),
             Self::Start { said, .. } | Self::Retry { said, .. } => (Some(&mut said.one), None),
@@ -259,6 +271,7 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Exclude { one, robot_id, reason, change } => {
             exclude(&one.call, one.rollout_id, robot_id, reason, change, out).await
         }
+        Verb::Lost { one, robot_id, reason, change } => write_off(one, robot_id, reason, change, out).await,
         Verb::Ls { call } => look::list(&call, out).await,
         Verb::Get { one, robots } => look::get(&one, robots, out).await,
         Verb::Robots(one) => look::robots(&one, out).await,
@@ -314,6 +327,24 @@ pub async fn exclude(
         validate_only: change.dry_run,
     };
     let answer = call.rollouts().await?.exclude_robot(unary(request)).await.map_err(Exit::with_facts)?;
+    let answer = answer.into_inner();
+    show(&answer.rollout.unwrap_or_default(), out)?;
+    ended(answer.done_before.as_ref(), only, "", out);
+    Ok(())
+}
+
+/// Counts a lost robot in no budget.
+async fn write_off(one: One, robot_id: String, reason: String, change: Change, out: &Out) -> Result<(), Exit> {
+    let only = change.only();
+    let request = v1::WriteOffRobotRequest {
+        rollout_id: one.rollout_id,
+        etag: String::new(),
+        reason,
+        robot_id,
+        request_id: change.request_id,
+        validate_only: change.dry_run,
+    };
+    let answer = one.call.rollouts().await?.write_off_robot(unary(request)).await.map_err(Exit::with_facts)?;
     let answer = answer.into_inner();
     show(&answer.rollout.unwrap_or_default(), out)?;
     ended(answer.done_before.as_ref(), only, "", out);

@@ -213,6 +213,23 @@ fn an_abort_among_few_says_what_it_costs_a_good_bundle() {
 }
 
 #[test]
+fn what_work_cost_on_trial_stands_beside_what_it_cost_the_others() {
+    let effort = |tasks, ms, energy_mwh| v1::Effort {
+        tasks,
+        duration: Some(duration(ms)),
+        path_mm: 2_000_000,
+        energy_mwh,
+        hottest_joint_decidegrees: 615,
+    };
+    let (trial, control) = (effort(10, 412_000, 600), effort(100, 3_900_000, 500));
+    let verdict = v1::RolloutVerdict { trial_effort: Some(trial), control_effort: Some(control), ..unproven() };
+    let told = "work: on trial 41.2 s a task, 300 mWh a km, joints up to 61.5 °C (n 10, 2.0 km); \
+        beside it 39.0 s a task, 250 mWh a km, joints up to 61.5 °C (n 100, 2.0 km)";
+    assert_eq!(text::evidence(&verdict).last().map(String::as_str), Some(told));
+    assert_eq!(text::evidence(&unproven()).len(), 3, "nothing is said of no work");
+}
+
+#[test]
 fn one_robot_is_explained_with_what_it_waits_for_and_until_when() {
     let waits = shown(&Reason::from(Code::BlockedByDrain)).message;
     let expected = format!(
@@ -225,6 +242,15 @@ rbt-04 in walk-1.5.0, wave 2/3: DRAINING since 1970-01-01T00:01:20.000Z
   drain walk-1.5.0/1"
     );
     assert_eq!(look::explanation(&rollout(), &draining()), expected);
+}
+
+#[test]
+fn an_explanation_says_since_when_a_robot_is_lost_and_who_wrote_it_off() {
+    let act = v1::RolloutAct { actor: "ana".into(), reason: "crushed".into(), time: at(95) };
+    let lost = v1::RolloutRobot { lost: at(90), written_off: Some(act), deadline: None, ..draining() };
+    let told = look::explanation(&rollout(), &lost);
+    assert!(told.contains("  lost since ") && told.contains("as long as it takes"), "{told}");
+    assert!(told.contains("  counts in no budget, written off by ana ") && told.contains("(crushed)"), "{told}");
 }
 
 #[test]
@@ -403,7 +429,8 @@ fn flags_become_the_spec_and_what_no_flag_says_is_left_to_the_server() {
     let flags = "create trial --bundle walk-1.5.0 --waves 1,25%,rest --soak 10s --probation 1m --drain-within 2h --exposure-tasks 0 \
         --exposure-within 90s --max-in-flight 2 --area hall,dock --robot r1 --robot r2 --label site=north --model h1 --from-version 1.4.0 \
         --small-wave review --small-wave-failure review --abort-scope trial --allow-full-push --rate 5MiB --acts-on-rates \
-        --complete-percent 75";
+        --complete-percent 75 --lost-after 1h --write-off-lost \
+        --rollback-floor 3 --max-slower 20 --max-hotter 5";
     let spec = Line::parse_from(flags.split_whitespace()).create.spec();
     let expected = v1::RolloutSpec {
         bundle: "walk-1.5.0".into(),
@@ -428,6 +455,14 @@ fn flags_become_the_spec_and_what_no_flag_says_is_left_to_the_server() {
         rate_bytes_s: 5 << 20,
         acts_on_rates: true,
         complete_percent: Some(75),
+        lost_after: Some(duration(3_600_000)),
+        writes_off_lost: true,
+        rollback_floor: 3,
+        effort: Some(v1::EffortLimits {
+            slower_permille: Some(200),
+            energy_permille: None,
+            hotter_decidegrees: Some(50),
+        }),
     };
     assert_eq!(spec, expected);
 }

@@ -180,6 +180,8 @@ pub fn header(rollout: &v1::Rollout) -> Vec<String> {
     if rollout.outcome() == v1::RolloutEnding::Incomplete {
         lines.push(format!("  {}", incomplete(rollout)));
     }
+    let cost = effort(rollout.trial_effort.as_ref(), rollout.control_effort.as_ref());
+    lines.extend(cost.map(|line| format!("  {line}")));
     let of = [("takes back", &rollout.revert_of), ("its place took", &rollout.superseded_by)];
     lines.extend(of.iter().filter(|(_, id)| !id.is_empty()).map(|(what, id)| format!("  {what} {id}")));
     lines.extend(rollout.abort.as_ref().map(|a| format!("  {}  {}", time(a.time.as_ref()), abort(a))));
@@ -328,6 +330,21 @@ pub fn verdict(verdict: &v1::RolloutVerdict, waves: u32) -> String {
     text
 }
 
+/// What work cost robots on trial beside the others; none: none of them has ended a task.
+fn effort(trial: Option<&v1::Effort>, control: Option<&v1::Effort>) -> Option<String> {
+    let told = |effort: &v1::Effort| {
+        let ms = effort.duration.as_ref().map_or(0, ms_of);
+        let s_a_task = if effort.tasks > 0 { ms as f64 / 1e3 / effort.tasks as f64 } else { 0.0 };
+        let km = effort.path_mm as f64 / 1e6;
+        let mwh_a_km = if effort.path_mm > 0 { effort.energy_mwh as f64 / km } else { 0.0 };
+        let heat = f64::from(effort.hottest_joint_decidegrees) / 10.0;
+        let n = effort.tasks;
+        format!("{s_a_task:.1} s a task, {mwh_a_km:.0} mWh a km, joints up to {heat:.1} °C (n {n}, {km:.1} km)")
+    };
+    let trial = trial.filter(|trial| trial.tasks > 0)?;
+    Some(format!("work: on trial {}; beside it {}", told(trial), control.map(told).unwrap_or_default()))
+}
+
 /// The evidence behind a verdict, on lines of their own.
 pub fn evidence(verdict: &v1::RolloutVerdict) -> Vec<String> {
     let (trial, control) = (verdict.trial.unwrap_or_default(), verdict.control.unwrap_or_default());
@@ -336,7 +353,7 @@ pub fn evidence(verdict: &v1::RolloutVerdict) -> Vec<String> {
         v1::Suspicion::OneSickRobot => "one sick robot?",
         v1::Suspicion::Release => "the release is suspected",
     };
-    vec![
+    let mut lines = vec![
         format!("{}  {}", time(verdict.time.as_ref()), because(verdict.reason.as_ref())),
         format!(
             "robots: log ratio {} (aborts at {}, proven at {})",
@@ -353,7 +370,9 @@ pub fn evidence(verdict: &v1::RolloutVerdict) -> Vec<String> {
             verdict.e_value_milli / 1000,
             verdict.e_value_milli % 1000
         ),
-    ]
+    ];
+    lines.extend(effort(verdict.trial_effort.as_ref(), verdict.control_effort.as_ref()));
+    lines
 }
 
 /// Parts of the time off work with a function that reads each.

@@ -28,12 +28,14 @@ fn bundle(bundle: BundleId) -> Bundle {
         version: "1.5.0".into(),
         manifest_length: 1,
         length: 1,
+        room: 2,
         hardware: BTreeSet::new(),
         needs: "restart".into(),
         hard_stop_codes: BTreeSet::new(),
         is_irreversible: false,
         has_base: false,
         requires: BTreeMap::new(),
+        rollback_index: None,
         listed: true,
         revoked: None,
         published: Utc(0),
@@ -64,6 +66,7 @@ fn soaking(bundle: BundleId) -> Rollout {
         superseded_by: None,
         tasks: FailureEvidence::default(),
         counted: Arc::default(),
+        efforts: Default::default(),
         created: Act { person: None, actor: "ana".into(), reason: String::new(), at: Utc(0) },
         approved: None,
         started: Some(Utc(0)),
@@ -95,7 +98,9 @@ fn on_trial() -> RolloutRobot {
         why: None,
         again: false,
         before: TaskTally::default(),
+        effort_before: Default::default(),
         moments: Moments { on_trial: Some(Utc(0)), ..Moments::default() },
+        lost: None,
     }
 }
 

@@ -40,9 +40,9 @@ async fn roll_outs_are_written_seen_and_approved_by_whoever_may_where_they_are_f
     release(&leader.ota, &files("walk", "1.0.0")).await;
     let standby = world.process().await;
     secs(2).await;
-    let anna = holder("anna", &["ota-author@hall", "ota-approver@hall", "viewer@quality"]);
+    let anna = holder("anna", &["ota-author@hall", "ota-full-push@hall", "ota-approver@hall", "viewer@quality"]);
     let blind = holder("ben", &["ota-approver@hall"]);
-    let carl = holder("carl", &["ota-author"]);
+    let carl = holder("carl", &["ota-author", "ota-full-push"]);
     for process in [&leader, &standby] {
         for areas in [&["quality"][..], &[]] {
             let (id, spec) = ("no".to_owned(), spec(areas));
