@@ -30,6 +30,7 @@ mod handed_over;
 mod harness;
 mod held;
 mod identity;
+mod key_files;
 mod kill;
 mod languages;
 mod largest;
