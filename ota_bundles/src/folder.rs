@@ -1,7 +1,11 @@
 //! A repository as release people keep it: a folder with `metadata/` and `targets/` that they sign into and push from.
 //!
 //! Invariant: a targets document gets its number only once enough people have signed it; until then it is `pending.targets.json` and
-//! nobody believes it. Files are in place before the document that names them.
+//! nobody believes it. Files are in place before the document that names them. A key that is not asked for signs nothing here.
+
+mod roots;
+
+pub use roots::WaitingRoot;
 
 use crate::build::{self, inspect};
 use crate::digest::Digest;
@@ -12,6 +16,7 @@ use crate::repository::{
     self, FileTarget, PEOPLE_LIFE_MS, Profile, RootDraft, Signers, add_signatures, check_root, check_targets, listed,
     sign_root, sign_targets, version_of,
 };
+use crate::roots::{Asked, merge_targets};
 use midshift_core::reason::{Refusal, Violations};
 use midshift_core::time::Utc;
 use std::collections::BTreeSet;
@@ -54,6 +59,16 @@ fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
     move |source| Error::Io { doing, path, source }
 }
 
+/// A document that waits follows the newest one.
+fn must_be_next(role: &str, version: u64, next: u64) -> Result<(), Refusal> {
+    if version == next {
+        return Ok(());
+    }
+    let text =
+        format!("{role} {version} waits and the next is {next}: remove metadata/pending.{role}.json and begin anew");
+    Err(Refusal::field("repository", text))
+}
+
 fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let folder = path.parent().unwrap_or(Path::new("."));
     let mut name = path.file_name().unwrap_or_default().to_owned();
@@ -69,7 +84,7 @@ fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
 /// What signing came to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Signed {
-    /// The document has its number.
+    /// The document has its number, and all signatures that it needs.
     Published(u64),
     /// More people must sign it.
     Pending,
@@ -194,9 +209,12 @@ impl Folder {
     pub fn targets_version(&self) -> Result<Option<u64>, Error> {
         Ok(self.newest("targets")?.map(|(number, _)| number))
     }
-    fn root(&self) -> Result<Vec<u8>, Error> {
-        let root = self.newest("root")?.map(|(_, document)| document);
-        root.ok_or_else(|| Refusal::field("repository", "has no root").into())
+    /// The newest root, and its number.
+    ///
+    /// # Errors
+    /// If there is none, or it cannot be read.
+    pub fn root(&self) -> Result<(u64, Vec<u8>), Error> {
+        self.newest("root")?.ok_or_else(|| Refusal::field("repository", "has no root").into())
     }
 
     /// Adds a built bundle and signs the targets document that lists it.
@@ -204,7 +222,7 @@ impl Folder {
     /// # Errors
     /// A bundle that is not what its manifest says, a name that stands for other bytes, a document that waits for signatures.
     pub fn add(&self, bundle: &Path, keys: &[&SecretKey], now: Utc) -> Result<(Manifest, Signed), Error> {
-        self.must_not_wait()?;
+        self.must_not_wait(keys)?;
         let manifest = inspect(bundle)?;
         let document = manifest.to_bytes();
         let mut files =
@@ -228,7 +246,7 @@ impl Folder {
     /// # Errors
     /// A bundle that the newest document does not list, a document that waits for signatures, a folder that does not hold together.
     pub fn withdraw(&self, bundle: &str, keys: &[&SecretKey], now: Utc) -> Result<(Manifest, Signed), Error> {
-        self.must_not_wait()?;
+        self.must_not_wait(keys)?;
         let is_meant = |m: &Manifest| {
             format!("{}-{}", m.name, m.version) == bundle || Digest::of(&m.to_bytes()).to_string() == bundle
         };
@@ -251,7 +269,7 @@ impl Folder {
     /// A file that is no such set, is not the next one, or is signed by no key of the set before nor of its own; a document that waits for
     /// signatures.
     pub fn add_keys(&self, envelope: &[u8], keys: &[&SecretKey], now: Utc) -> Result<(KeySet, Signed), Error> {
-        self.must_not_wait()?;
+        self.must_not_wait(keys)?;
         let refused = |text: String| Refusal::field("bundle", text);
         let set = KeySet::read(envelope).map_err(|e| refused(e.to_string()))?;
         let before = self.check()?.key_set;
@@ -272,25 +290,52 @@ impl Folder {
         Ok((set, self.put(&signed)?))
     }
 
-    fn must_not_wait(&self) -> Result<(), Error> {
+    /// Signs the newest targets document anew, with the next number and a year of its own: after a root that changes who signs, or when it ends.
+    ///
+    /// # Errors
+    /// If none was signed, or one waits for signatures.
+    pub fn renew(&self, keys: &[&SecretKey], now: Utc) -> Result<Signed, Error> {
+        self.must_not_wait(keys)?;
+        let Some((_, previous)) = self.newest("targets")? else {
+            return Err(Refusal::field("repository", "no targets document was signed yet").into());
+        };
+        self.put(&sign_targets(Some(&previous), &[], &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?)
+    }
+
+    /// No document waits, and each of `keys` is asked for.
+    fn must_not_wait(&self, keys: &[&SecretKey]) -> Result<(), Error> {
         if self.metadata().join(PENDING).exists() {
             let text = "a document waits for signatures: sign that first, or remove metadata/pending.targets.json";
             return Err(Refusal::field("repository", text).into());
         }
-        Ok(())
+        Ok(Asked::for_targets(&self.root()?.1)?.must_name(keys)?)
     }
 
-    /// Adds signatures to the document that waits for them.
+    /// Adds signatures to the document that waits for them: by `keys`, and those that others handed over. Where none waits yet, the first
+    /// document that was handed over does from now on.
     ///
     /// # Errors
-    /// If none waits.
-    pub fn cosign(&self, keys: &[&SecretKey]) -> Result<Signed, Error> {
-        let signed = add_signatures(&self.read(PENDING)?, keys)?;
-        self.put(&signed)
+    /// If none waits; a key that is not asked for; what was handed over and is no signature of this document. Nothing is added then.
+    pub fn cosign(&self, keys: &[&SecretKey], handed: &[Vec<u8>]) -> Result<Signed, Error> {
+        let asked = Asked::for_targets(&self.root()?.1)?;
+        asked.must_name(keys)?;
+        let mut document = match (self.document(PENDING)?, handed.first()) {
+            (Some(waiting), _) => waiting,
+            (None, Some(handed)) => {
+                let next = self.targets_version()?.unwrap_or_default() + 1;
+                must_be_next("targets", version_of(handed)?, next)?;
+                handed.clone()
+            }
+            (None, None) => return Err(Refusal::field("pending", "no targets document waits for signatures").into()),
+        };
+        for handed in handed {
+            document = merge_targets(&document, handed, &asked)?;
+        }
+        self.put(&add_signatures(&document, keys)?)
     }
 
     fn put(&self, document: &[u8]) -> Result<Signed, Error> {
-        if check_targets(&self.root()?, document).is_err() {
+        if check_targets(&self.root()?.1, document).is_err() {
             self.write(PENDING, document)?;
             return Ok(Signed::Pending);
         }

@@ -7,6 +7,7 @@ mod key_sets;
 mod keyring;
 mod metadata;
 mod releasing;
+mod roots;
 mod says;
 mod sets;
 mod shelf;

@@ -25,8 +25,10 @@ impl Place {
         let verb = Verb::Sign {
             bundle: Some(self.path(&format!("{number}.directive-keys"))),
             pending: false,
+            renew: false,
             repository: self.path("repository"),
             key: vec![self.path("keys/targets-1.pem")],
+            signature: Vec::new(),
             server: None,
             upstream,
         };
