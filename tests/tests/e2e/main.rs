@@ -17,6 +17,7 @@ mod arena;
 mod audited;
 mod batches;
 mod begin_and_end;
+mod ceremony;
 mod changed_map;
 mod clients;
 mod cut;
