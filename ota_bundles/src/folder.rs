@@ -4,6 +4,7 @@
 //! nobody believes it. Files are in place before the document that names them. A key that is not asked for signs nothing here.
 
 mod roots;
+mod ways;
 
 pub use roots::WaitingRoot;
 
@@ -222,6 +223,31 @@ impl Folder {
     /// # Errors
     /// A bundle that is not what its manifest says, a name that stands for other bytes, a document that waits for signatures.
     pub fn add(&self, bundle: &Path, keys: &[&SecretKey], now: Utc) -> Result<(Manifest, Signed), Error> {
+        self.add_and(bundle, keys, now, |_, _| Ok(Vec::new()))
+    }
+
+    /// As [`Folder::add`], with shorter ways to its files: alone, from the newest releases of the same bundle, and from those that `from` names as
+    /// NAME-VERSION.
+    ///
+    /// # Errors
+    /// As there; a release that is not listed; files of releases before that are not in this folder.
+    pub fn add_with_ways(
+        &self,
+        bundle: &Path,
+        from: &[String],
+        keys: &[&SecretKey],
+        now: Utc,
+    ) -> Result<(Manifest, Signed), Error> {
+        self.add_and(bundle, keys, now, |manifest, previous| self.make_ways(bundle, manifest, previous, from))
+    }
+
+    fn add_and(
+        &self,
+        bundle: &Path,
+        keys: &[&SecretKey],
+        now: Utc,
+        beside: impl FnOnce(&Manifest, Option<&[u8]>) -> Result<Vec<FileTarget>, Error>,
+    ) -> Result<(Manifest, Signed), Error> {
         self.must_not_wait(keys)?;
         let manifest = inspect(bundle)?;
         let document = manifest.to_bytes();
@@ -233,11 +259,15 @@ impl Folder {
             length: c.length,
         }));
         let previous = self.newest("targets")?.map(|(_, document)| document);
-        let signed = sign_targets(previous.as_deref(), &files, &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?;
+        let expires = now.plus_ms(PEOPLE_LIFE_MS);
+        // What may not be listed is refused before anything is made of it.
+        sign_targets(previous.as_deref(), &files, &[], expires, &[])?;
+        let ways = beside(&manifest, previous.as_deref())?;
         for file in &files {
             self.copy(&bundle.join(&file.name), &self.file(&file.name, file.digest))?;
         }
-        Ok((manifest, self.put(&signed)?))
+        files.extend(ways);
+        Ok((manifest, self.put(&sign_targets(previous.as_deref(), &files, &[], expires, keys)?)?))
     }
 
     /// Signs a targets document that lists a bundle no more, nor files that only it has. The files stay in this folder: the document
@@ -257,8 +287,12 @@ impl Folder {
         };
         let needed: BTreeSet<String> = others.iter().flat_map(|m| m.components.iter().map(Component::target)).collect();
         let own = withdrawn.components.iter().map(Component::target).filter(|name| !needed.contains(name));
-        let gone: Vec<String> = own.chain([withdrawn.target()]).collect();
+        let mut gone: Vec<String> = own.chain([withdrawn.target()]).collect();
+        let kept: BTreeSet<Digest> = others.iter().flat_map(|m| m.components.iter().map(|c| c.digest)).collect();
+        let lost = withdrawn.components.iter().map(|c| c.digest).filter(|digest| !kept.contains(digest)).collect();
         let previous = self.newest("targets")?.map(|(_, document)| document);
+        let known = previous.as_deref().map(listed).transpose()?.unwrap_or_default();
+        gone.extend(ways::that_lead_to(&lost, &known).map(str::to_owned));
         let signed = sign_targets(previous.as_deref(), &[], &gone, now.plus_ms(PEOPLE_LIFE_MS), keys)?;
         Ok((withdrawn, self.put(&signed)?))
     }

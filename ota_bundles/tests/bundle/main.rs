@@ -12,3 +12,4 @@ mod says;
 mod sets;
 mod shelf;
 mod twins;
+mod ways;

@@ -76,6 +76,9 @@ pub enum Verb {
         /// A secret key of targets; more than one if you hold more.
         #[arg(long, required_unless_present = "signature")]
         key: Vec<PathBuf>,
+        /// A release, as NAME-VERSION, from which robots come beside the newest three: what they lack is made and signed too, so that they fetch less.
+        #[arg(long, requires = "bundle")]
+        from: Vec<String>,
         /// With --pending, what another person handed over: their pending.targets.json.
         #[arg(long, requires = "pending")]
         signature: Vec<PathBuf>,
@@ -205,7 +208,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Trust { repository, directive, site, out: into } => {
             root::trust(&repository, &directive, &site, &into, out)
         }
-        Verb::Sign { bundle, pending, renew: _, repository, key, signature, server, upstream } => {
+        Verb::Sign { bundle, pending, renew: _, from, repository, key, signature, server, upstream } => {
             if let Some(server) = server {
                 push::has_all_of_server(Folder::open(&repository)?, &Call::to(server)).await?;
             }
@@ -213,7 +216,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
                 push::has_all_of_copy(&Folder::open(&repository)?, &Folder::open(&copy)?)?;
             }
             let what = match bundle {
-                Some(bundle) => What::New(bundle),
+                Some(bundle) => What::New(bundle, from),
                 None if pending => What::Pending(handed(&signature)?),
                 None => What::Again,
             };
@@ -335,8 +338,8 @@ fn handed(paths: &[PathBuf]) -> Result<Vec<Vec<u8>>, Exit> {
 
 /// What is signed.
 enum What {
-    /// This bundle, or set of directive keys.
-    New(PathBuf),
+    /// This bundle, with patches from these releases too; or this set of directive keys.
+    New(PathBuf, Vec<String>),
     /// What waits, with what others handed over.
     Pending(Vec<Vec<u8>>),
     /// What was signed before.
@@ -348,9 +351,9 @@ fn sign(what: &What, repository: &Path, keys: &[PathBuf], out: &Out) -> Result<(
     let keys = read_keys(keys)?;
     let keys: Vec<&SecretKey> = keys.iter().collect();
     let signed = match what {
-        What::New(bundle) => match key_set(bundle)? {
+        What::New(bundle, from) => match key_set(bundle)? {
             Some(set) => folder.add_keys(&set, &keys, clock::wall())?.1,
-            None => folder.add(bundle, &keys, clock::wall())?.1,
+            None => folder.add_with_ways(bundle, from, &keys, clock::wall())?.1,
         },
         What::Pending(handed) => folder.cosign(&keys, handed)?,
         What::Again => folder.renew(&keys, clock::wall())?,

@@ -26,6 +26,7 @@ impl Place {
             bundle: Some(self.path(&format!("{number}.directive-keys"))),
             pending: false,
             renew: false,
+            from: Vec::new(),
             repository: self.path("repository"),
             key: vec![self.path("keys/targets-1.pem")],
             signature: Vec::new(),
