@@ -13,3 +13,4 @@ mod sets;
 mod shelf;
 mod twins;
 mod ways;
+mod workflow;

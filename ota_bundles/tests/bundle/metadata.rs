@@ -9,7 +9,7 @@ use midshift_core::time::Utc;
 use std::sync::Arc;
 
 /// The name of the rule of the library that refused.
-fn rule(error: &Error) -> String {
+pub fn rule(error: &Error) -> String {
     match error {
         Error::Metadata(e) => format!("{e:?}").split([' ', '{', '(']).next().unwrap_or_default().to_owned(),
         other => format!("{other:?}").split([' ', '{', '(']).next().unwrap_or_default().to_owned(),
