@@ -38,6 +38,7 @@ mod largest;
 mod launched;
 mod ledger_cuts;
 mod looked_up;
+mod made_elsewhere;
 mod many;
 mod measured;
 mod mid_shift;

@@ -110,6 +110,12 @@ elif part == "second":
     lies["2.targets.json"] = get("2.targets.json").replace(b"1.6.0", b"6.6.6")
     refused("targets that were tampered with", exceptions.RepositoryError, client("mixed", between).refresh)
     lies.clear()
+    lies["2.root.json"] = get("1.root.json")
+    refused("a root that is not the next", exceptions.BadVersionNumberError, client("mixed", between).refresh)
+    lies.clear()
+    lies["timestamp.json"] = get("timestamp.json") + b" " * 100_000
+    refused("a timestamp without an end", exceptions.DownloadError, client("mixed", between).refresh)
+    lies.clear()
     client("mixed", between).refresh()
     frozen = client("frozen")
     frozen._trusted_set.reference_time = datetime.datetime.now(datetime.timezone.utc) + datetime.timedelta(days=2)
@@ -190,6 +196,8 @@ async fn python_tuf_takes_releases_and_refuses_lies() -> anyhow::Result<()> {
         "refused: a snapshot of another release",
         "refused: targets of another release",
         "refused: targets that were tampered with",
+        "refused: a root that is not the next",
+        "refused: a timestamp without an end",
         "refused: a timestamp that was frozen",
     ];
     assert_eq!(python(dir, &server, "second", "repository")?, refused);
