@@ -60,6 +60,7 @@ impl Forge {
     async fn refused(&self, robot: &Trusted, why: &str) {
         let error = self.0.shown_to(robot).await.expect_err(why);
         assert_eq!(rule(&error), why, "{error}");
+        assert!(!error.is_unreachable(), "it came, and was wrong: {error}");
     }
 }
 
