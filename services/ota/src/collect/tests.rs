@@ -302,3 +302,23 @@ async fn a_robot_that_names_a_file_that_is_no_bundle_keeps_that_file_and_stops_n
     shop.after(1).await;
     assert_eq!(shop.after(TIME).await.files, 2, "nobody names them any more");
 }
+
+#[tokio::test]
+async fn a_file_that_the_disk_holds_on_to_stops_no_pass_and_goes_when_it_can() {
+    let mut shop = Shop::new(1 << 20).await;
+    for content in [b"stuck", b"stray"] {
+        shop.bring(content).await.expect("room");
+    }
+    shop.after(1).await;
+    // No file can be removed where a folder with something in it is.
+    let path = shop.dir.path().join("content").join(Digest::of(b"stuck").to_string());
+    fs::remove_file(&path).expect("gone");
+    fs::create_dir_all(path.join("in-the-way")).expect("a folder");
+    let done = shop.after(TIME).await;
+    assert_eq!((done.files, done.failed, done.unnamed_bytes), (1, 1, 5));
+    assert!(!shop.has(b"stray").await, "the pass went to its end");
+    fs::remove_dir_all(&path).expect("gone");
+    fs::write(&path, b"stuck").expect("back");
+    let done = shop.after(0).await;
+    assert_eq!((done.files, done.failed, done.unnamed_bytes), (1, 0, 0));
+}
