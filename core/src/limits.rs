@@ -297,8 +297,6 @@ pub const UPLOAD_SYNC_BYTES: u64 = 16 * 1024 * 1024;
 pub const SOFTWARE_TURN_WAIT: LinkDuration = LinkDuration::from_secs(20);
 /// Processes that share a folder of releases look this often whether another one published, ms.
 pub const SOFTWARE_FOLLOW_EVERY_MS: u64 = 1_000;
-/// Versions before a file from which patches to it are made without being asked for, where gateways ask for none.
-pub const ENCODING_BASES_AHEAD: usize = 3;
 /// Bytes of all software that a server keeps, unless it was told otherwise.
 pub const SOFTWARE_BYTES_DEFAULT: u64 = 64 * 1024 * 1024 * 1024;
 /// Bytes that a server leaves free on the disk when it takes software, unless it was told otherwise: the databases lie there too.
@@ -310,14 +308,8 @@ pub const SOFTWARE_UNNAMED_DAYS_DEFAULT: u64 = 7;
 pub const ROLLOUT_NAMES_DAYS: u64 = 30;
 /// Serving time between two looks at which software is still named, ms. The first is so long after a start.
 pub const COLLECT_EVERY_MS: u64 = 600_000;
-/// Shorter ways to files of releases that wait to be made: each is one version to go from, and a fleet has few of them at a time.
-pub const ENCODINGS_QUEUED_MAX: usize = 64;
-/// Shorter ways that were found not to be worth it and are remembered.
-pub const ENCODINGS_WORTHLESS_MAX: usize = 4096;
 /// Files that a robot names as there when it asks for a shorter way to another.
 pub const ENCODING_BASES_MAX: usize = 8;
-/// A robot asks again after this while a shorter way is made, ms.
-pub const ENCODING_ASK_AGAIN_MS: u32 = 2_000;
 /// A set has been committed for so long before a new base takes the slot of the one before it, ms of UTC on the robot's site clock.
 pub const BASE_SETTLED_MS: u64 = 24 * 3_600_000;
 /// One call of a program that migrates data may take so long, ms; after that it is called again.

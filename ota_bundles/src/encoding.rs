@@ -4,8 +4,7 @@
 //! the other file, [`REACH_BYTES`] before and after its own place: bytes that moved farther come again. So nobody holds more than
 //! 128 MiB (2^[`WINDOW_LOG`]) of content in memory, however long the file. A patch of one segment is what `zstd --patch-from` writes, and
 //! a file without a patch is one that `zstd -d` reads.
-//! Invariant: the same bytes in give the same bytes out, so a download goes on after they were made again; what comes out is believed by
-//! nobody before its digest is. Called by the server to write and by robots to read.
+//! Invariant: what comes out is believed by nobody before its digest is. Called by whoever signs a release to write, and by robots to read.
 
 use crate::digest::{Digest, Hashing};
 use std::io::{self, BufReader, Read, Seek, SeekFrom, Write};
@@ -20,9 +19,9 @@ pub const REACH_BYTES: u64 = 32 * 1024 * 1024;
 pub const WINDOW_LOG: u32 = 27;
 /// A shorter file is fetched as it is: asking costs as much, bytes.
 pub const ENCODED_BYTES_MIN: u64 = 16 * 1024;
-/// A longer file is fetched as it is: making it shorter would hold the server's one maker for minutes, bytes.
+/// A longer file is fetched as it is: making it shorter would hold up who signs for minutes, bytes.
 pub const ENCODED_BYTES_MAX: u64 = 1024 * 1024 * 1024;
-/// Effort of the server: of 1..22 the last before zstd becomes slow.
+/// Effort of the writer: of 1..22 the last before zstd becomes slow.
 const LEVEL: i32 = 9;
 
 /// A file that can be read from any place.

@@ -1,7 +1,12 @@
 //! A repository as release people keep it: a folder with `metadata/` and `targets/` that they sign into and push from.
 //!
 //! Invariant: a targets document gets its number only once enough people have signed it; until then it is `pending.targets.json` and
-//! nobody believes it. Files are in place before the document that names them.
+//! nobody believes it. Files are in place before the document that names them. A key that is not asked for signs nothing here.
+
+mod roots;
+mod ways;
+
+pub use roots::WaitingRoot;
 
 use crate::build::{self, inspect};
 use crate::digest::Digest;
@@ -12,6 +17,7 @@ use crate::repository::{
     self, FileTarget, PEOPLE_LIFE_MS, Profile, RootDraft, Signers, add_signatures, check_root, check_targets, listed,
     sign_root, sign_targets, version_of,
 };
+use crate::roots::{Asked, merge_targets};
 use midshift_core::reason::{Refusal, Violations};
 use midshift_core::time::Utc;
 use std::collections::BTreeSet;
@@ -54,6 +60,16 @@ fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
     move |source| Error::Io { doing, path, source }
 }
 
+/// A document that waits follows the newest one.
+fn must_be_next(role: &str, version: u64, next: u64) -> Result<(), Refusal> {
+    if version == next {
+        return Ok(());
+    }
+    let text =
+        format!("{role} {version} waits and the next is {next}: remove metadata/pending.{role}.json and begin anew");
+    Err(Refusal::field("repository", text))
+}
+
 /// Copies a file that is not there yet.
 fn copy(from: &Path, to: &Path) -> Result<(), Error> {
     if to.exists() {
@@ -71,7 +87,7 @@ fn copy(from: &Path, to: &Path) -> Result<(), Error> {
 /// What signing came to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Signed {
-    /// The document has its number.
+    /// The document has its number, and all signatures that it needs.
     Published(u64),
     /// More people must sign it.
     Pending,
@@ -196,9 +212,12 @@ impl Folder {
     pub fn targets_version(&self) -> Result<Option<u64>, Error> {
         Ok(self.newest("targets")?.map(|(number, _)| number))
     }
-    fn root(&self) -> Result<Vec<u8>, Error> {
-        let root = self.newest("root")?.map(|(_, document)| document);
-        root.ok_or_else(|| Refusal::field("repository", "has no root").into())
+    /// The newest root, and its number.
+    ///
+    /// # Errors
+    /// If there is none, or it cannot be read.
+    pub fn root(&self) -> Result<(u64, Vec<u8>), Error> {
+        self.newest("root")?.ok_or_else(|| Refusal::field("repository", "has no root").into())
     }
 
     /// Adds a built bundle and signs the targets document that lists it.
@@ -206,7 +225,32 @@ impl Folder {
     /// # Errors
     /// A bundle that is not what its manifest says, a name that stands for other bytes, a document that waits for signatures.
     pub fn add(&self, bundle: &Path, keys: &[&SecretKey], now: Utc) -> Result<(Manifest, Signed), Error> {
-        self.must_not_wait()?;
+        self.add_and(bundle, keys, now, |_, _| Ok(Vec::new()))
+    }
+
+    /// As [`Folder::add`], with shorter ways to its files: alone, from the newest releases of the same bundle, and from those that `from` names as
+    /// NAME-VERSION.
+    ///
+    /// # Errors
+    /// As there; a release that is not listed; files of releases before that are not in this folder.
+    pub fn add_with_ways(
+        &self,
+        bundle: &Path,
+        from: &[String],
+        keys: &[&SecretKey],
+        now: Utc,
+    ) -> Result<(Manifest, Signed), Error> {
+        self.add_and(bundle, keys, now, |manifest, previous| self.make_ways(bundle, manifest, previous, from))
+    }
+
+    fn add_and(
+        &self,
+        bundle: &Path,
+        keys: &[&SecretKey],
+        now: Utc,
+        beside: impl FnOnce(&Manifest, Option<&[u8]>) -> Result<Vec<FileTarget>, Error>,
+    ) -> Result<(Manifest, Signed), Error> {
+        self.must_not_wait(keys)?;
         let manifest = inspect(bundle)?;
         let document = manifest.to_bytes();
         let mut files =
@@ -217,11 +261,15 @@ impl Folder {
             length: c.length,
         }));
         let previous = self.newest("targets")?.map(|(_, document)| document);
-        let signed = sign_targets(previous.as_deref(), &files, &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?;
+        let expires = now.plus_ms(PEOPLE_LIFE_MS);
+        // What may not be listed is refused before anything is made of it.
+        sign_targets(previous.as_deref(), &files, &[], expires, &[])?;
+        let ways = beside(&manifest, previous.as_deref())?;
         for file in &files {
             copy(&bundle.join(&file.name), &self.file(&file.name, file.digest))?;
         }
-        Ok((manifest, self.put(&signed)?))
+        files.extend(ways);
+        Ok((manifest, self.put(&sign_targets(previous.as_deref(), &files, &[], expires, keys)?)?))
     }
 
     /// Signs a targets document that lists a bundle no more, nor files that only it has. The files stay in this folder: the document
@@ -230,7 +278,7 @@ impl Folder {
     /// # Errors
     /// A bundle that the newest document does not list, a document that waits for signatures, a folder that does not hold together.
     pub fn withdraw(&self, bundle: &str, keys: &[&SecretKey], now: Utc) -> Result<(Manifest, Signed), Error> {
-        self.must_not_wait()?;
+        self.must_not_wait(keys)?;
         let is_meant = |m: &Manifest| {
             format!("{}-{}", m.name, m.version) == bundle || Digest::of(&m.to_bytes()).to_string() == bundle
         };
@@ -241,8 +289,12 @@ impl Folder {
         };
         let needed: BTreeSet<String> = others.iter().flat_map(|m| m.components.iter().map(Component::target)).collect();
         let own = withdrawn.components.iter().map(Component::target).filter(|name| !needed.contains(name));
-        let gone: Vec<String> = own.chain([withdrawn.target()]).collect();
+        let mut gone: Vec<String> = own.chain([withdrawn.target()]).collect();
+        let kept: BTreeSet<Digest> = others.iter().flat_map(|m| m.components.iter().map(|c| c.digest)).collect();
+        let lost = withdrawn.components.iter().map(|c| c.digest).filter(|digest| !kept.contains(digest)).collect();
         let previous = self.newest("targets")?.map(|(_, document)| document);
+        let known = previous.as_deref().map(listed).transpose()?.unwrap_or_default();
+        gone.extend(ways::that_lead_to(&lost, &known).map(str::to_owned));
         let signed = sign_targets(previous.as_deref(), &[], &gone, now.plus_ms(PEOPLE_LIFE_MS), keys)?;
         Ok((withdrawn, self.put(&signed)?))
     }
@@ -253,7 +305,7 @@ impl Folder {
     /// A file that is no such set, is not the next one, or is signed by no key of the set before nor of its own; a document that waits for
     /// signatures.
     pub fn add_keys(&self, envelope: &[u8], keys: &[&SecretKey], now: Utc) -> Result<(KeySet, Signed), Error> {
-        self.must_not_wait()?;
+        self.must_not_wait(keys)?;
         let refused = |text: String| Refusal::field("bundle", text);
         let set = KeySet::read(envelope).map_err(|e| refused(e.to_string()))?;
         let before = self.check()?.key_set;
@@ -274,25 +326,52 @@ impl Folder {
         Ok((set, self.put(&signed)?))
     }
 
-    fn must_not_wait(&self) -> Result<(), Error> {
+    /// Signs the newest targets document anew, with the next number and a year of its own: after a root that changes who signs, or when it ends.
+    ///
+    /// # Errors
+    /// If none was signed, or one waits for signatures.
+    pub fn renew(&self, keys: &[&SecretKey], now: Utc) -> Result<Signed, Error> {
+        self.must_not_wait(keys)?;
+        let Some((_, previous)) = self.newest("targets")? else {
+            return Err(Refusal::field("repository", "no targets document was signed yet").into());
+        };
+        self.put(&sign_targets(Some(&previous), &[], &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?)
+    }
+
+    /// No document waits, and each of `keys` is asked for.
+    fn must_not_wait(&self, keys: &[&SecretKey]) -> Result<(), Error> {
         if self.metadata().join(PENDING).exists() {
             let text = "a document waits for signatures: sign that first, or remove metadata/pending.targets.json";
             return Err(Refusal::field("repository", text).into());
         }
-        Ok(())
+        Ok(Asked::for_targets(&self.root()?.1)?.must_name(keys)?)
     }
 
-    /// Adds signatures to the document that waits for them.
+    /// Adds signatures to the document that waits for them: by `keys`, and those that others handed over. Where none waits yet, the first
+    /// document that was handed over does from now on.
     ///
     /// # Errors
-    /// If none waits.
-    pub fn cosign(&self, keys: &[&SecretKey]) -> Result<Signed, Error> {
-        let signed = add_signatures(&self.read(PENDING)?, keys)?;
-        self.put(&signed)
+    /// If none waits; a key that is not asked for; what was handed over and is no signature of this document. Nothing is added then.
+    pub fn cosign(&self, keys: &[&SecretKey], handed: &[Vec<u8>]) -> Result<Signed, Error> {
+        let asked = Asked::for_targets(&self.root()?.1)?;
+        asked.must_name(keys)?;
+        let mut document = match (self.document(PENDING)?, handed.first()) {
+            (Some(waiting), _) => waiting,
+            (None, Some(handed)) => {
+                let next = self.targets_version()?.unwrap_or_default() + 1;
+                must_be_next("targets", version_of(handed)?, next)?;
+                handed.clone()
+            }
+            (None, None) => return Err(Refusal::field("pending", "no targets document waits for signatures").into()),
+        };
+        for handed in handed {
+            document = merge_targets(&document, handed, &asked)?;
+        }
+        self.put(&add_signatures(&document, keys)?)
     }
 
     fn put(&self, document: &[u8]) -> Result<Signed, Error> {
-        if check_targets(&self.root()?, document).is_err() {
+        if check_targets(&self.root()?.1, document).is_err() {
             self.write(PENDING, document)?;
             return Ok(Signed::Pending);
         }

@@ -1,15 +1,17 @@
 //! Keys of release people and of the rollout service: ed25519, kept as PKCS#8 PEM, so that other tools can make and read them.
 //!
-//! Invariant: a secret key is never shown, logged or sent; its file is readable by its owner only.
+//! Written is version 1, RFC 5208, which has the secret alone: OpenSSL, Node and Python read no other. Version 2, which has the public key beside
+//! it, is read too. Invariant: a secret key is never shown, logged or sent; its file is readable by its owner only.
 
 use crate::digest::Digest;
 use ed25519_dalek::pkcs8::spki::der::pem::LineEnding;
-use ed25519_dalek::pkcs8::{DecodePrivateKey, DecodePublicKey, EncodePrivateKey, EncodePublicKey};
+use ed25519_dalek::pkcs8::{DecodePrivateKey, DecodePublicKey, EncodePrivateKey, EncodePublicKey, KeypairBytes};
 use ed25519_dalek::{Signer, SigningKey, VerifyingKey};
 use serde_json::json;
 use std::fmt;
 use std::fs;
 use std::io;
+use std::ops::Deref;
 use std::path::{Path, PathBuf};
 
 /// A key file that is none, or could not be read or written.
@@ -130,12 +132,15 @@ impl SecretKey {
     pub fn sign(&self, message: &[u8]) -> [u8; 64] {
         self.0.sign(message).to_bytes()
     }
-    /// As PEM, for whoever keeps it where nobody else reads.
+    /// As PEM of version 1, for whoever keeps it where nobody else reads.
     pub fn to_pem(&self) -> String {
-        let pem = self.0.to_pkcs8_pem(LineEnding::LF).unwrap_or_else(|e| unreachable!("32 bytes: {e}"));
-        String::clone(&pem)
+        String::clone(&self.pem())
     }
-    /// From what [`SecretKey::to_pem`] wrote.
+    fn pem(&self) -> impl Deref<Target = String> {
+        let alone = KeypairBytes { secret_key: self.0.to_bytes(), public_key: None };
+        alone.to_pkcs8_pem(LineEnding::LF).unwrap_or_else(|e| unreachable!("32 bytes: {e}"))
+    }
+    /// From what [`SecretKey::to_pem`] or another tool wrote, of either version.
     pub fn from_pem(text: &str) -> Option<Self> {
         SigningKey::from_pkcs8_pem(text).ok().map(Self)
     }
@@ -152,13 +157,12 @@ impl SecretKey {
     /// # Errors
     /// If it is there already or cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), Error> {
-        let text = self.0.to_pkcs8_pem(LineEnding::LF).map_err(|_| Error::NoKey { path: path.to_owned() })?;
-        write(path, text.as_bytes(), 0o600)
+        write(path, self.pem().as_bytes(), 0o600)
     }
 }
 
 /// Lower-case hexadecimal digits.
-pub(crate) fn hex(bytes: &[u8]) -> String {
+pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 

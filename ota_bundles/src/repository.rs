@@ -114,7 +114,7 @@ fn version(role: &'static str, number: u64) -> Result<NonZeroU64, Error> {
     NonZeroU64::new(number).ok_or_else(|| rule(role, "versions begin with 1"))
 }
 
-fn canonical(role: &impl Serialize) -> Vec<u8> {
+pub(crate) fn canonical(role: &impl Serialize) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut serializer = serde_json::Serializer::with_formatter(&mut bytes, CanonicalFormatter::new());
     role.serialize(&mut serializer).unwrap_or_else(|e| unreachable!("metadata is plain JSON: {e}"));
@@ -122,7 +122,7 @@ fn canonical(role: &impl Serialize) -> Vec<u8> {
 }
 
 /// Signs a document with all of `keys`, beside the signatures it has.
-fn sign<T: Role + Serialize>(mut document: Signed<T>, keys: &[&SecretKey]) -> Result<Vec<u8>, Error> {
+pub(crate) fn sign<T: Role + Serialize>(mut document: Signed<T>, keys: &[&SecretKey]) -> Result<Vec<u8>, Error> {
     let message = canonical(&document.signed);
     for key in keys {
         let signature = json!({"keyid": key.public().id().to_string(), "sig": hex(&key.sign(&message))});

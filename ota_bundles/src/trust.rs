@@ -126,9 +126,13 @@ pub enum Error {
 }
 
 impl Error {
-    /// The documents could not be had: nothing was wrong with them.
+    /// The documents could not be had: nothing was wrong with them. Bytes that came and are not those that were signed, or too many of them, are
+    /// wrong, though `tough` tells both as trouble of the line.
     pub fn is_unreachable(&self) -> bool {
-        matches!(self, Self::Metadata(error) if matches!(**error, tough::error::Error::Transport { .. }))
+        let Self::Metadata(error) = self else { return false };
+        let tough::error::Error::Transport { source, .. } = &**error else { return false };
+        let is_of_line = std::error::Error::source(source).is_some_and(|cause| cause.is::<io::Error>());
+        is_of_line || matches!(source.kind(), TransportErrorKind::FileNotFound)
     }
 }
 

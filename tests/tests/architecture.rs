@@ -125,7 +125,6 @@ const LOGGED: &[(&str, &str, &str)] = &[
     ("services/midshift/src/dev.rs", "warning", "what the lint says of the site's own file"),
     ("services/midshift/src/robots.rs", "deed", "a word and an id"),
     ("services/midshift/src/serve.rs", "warning", "what the lint says of the site's own file"),
-    ("services/ota/src/encodings.rs", "base", "a digest"),
     ("services/ota/src/repository.rs", "why", "one of a closed list of words"),
     ("services/ota/src/repository.rs", "advice", "a sentence of this program"),
     ("services/ota/src/repository/documents.rs", "problem", "what is wrong with a signed file"),

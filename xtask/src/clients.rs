@@ -18,7 +18,7 @@ const NODE_NEEDED: u32 = 20;
 const MADE: [&str; 8] =
     ["node_modules", "gen", "dist", "bin", "build", "built", "__pycache__", "midshift_client.egg-info"];
 /// Programs of the Go client that tests start.
-const GO_PROGRAMS: [&str; 3] = ["./cmd/tour", "./cmd/endure", "./cmd/batch"];
+const GO_PROGRAMS: [&str; 4] = ["./cmd/tour", "./cmd/endure", "./cmd/batch", "./cmd/keyfile"];
 
 /// The copy of one client.
 fn copy_of(workspace: &Workspace, client: &str) -> PathBuf {

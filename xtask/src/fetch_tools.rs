@@ -16,6 +16,8 @@ const BUF: &str = "github.com/bufbuild/buf/cmd/buf@v1.57.2";
 const STRACE: &str = "strace";
 /// Its package and program of the system.
 const HAPROXY: &str = "haproxy";
+/// Its package and program of the system.
+const OPENSSL: &str = "openssl";
 /// What the Python client needs; it pins gRPC for all of Python here.
 const PYTHON_CLIENT: &str = include_str!("../../clients/python/requirements.txt");
 const PYTHON: &[&str] = &["tuf==7.0.1", "securesystemslib[crypto]==1.6.0", "cryptography==50.0.2"];
@@ -37,6 +39,8 @@ pub struct Tools {
     pub strace: PathBuf,
     /// HAProxy, 2.6 or newer.
     pub haproxy: PathBuf,
+    /// OpenSSL, 3.0 or newer.
+    pub openssl: PathBuf,
     /// Node.js, the system's.
     pub node: PathBuf,
 }
@@ -51,6 +55,7 @@ impl Tools {
             python: tools.join("venv/bin/python"),
             strace: STRACE.into(),
             haproxy: HAPROXY.into(),
+            openssl: OPENSSL.into(),
             node: clients::NODE.into(),
         }
     }
@@ -73,6 +78,9 @@ impl Tools {
         }
         if !tools.has_haproxy() {
             missing.push(format!("  {HAPROXY}, a program of the system"));
+        }
+        if !tools.has_openssl() {
+            missing.push(format!("  {OPENSSL} 3.0 or newer, a program of the system"));
         }
         missing.extend(clients::missing(workspace).into_iter().map(|what| format!("  {what}")));
         if !has_postgresql(Path::new(POSTGRESQL_PROGRAMS)) {
@@ -110,6 +118,9 @@ impl Tools {
         if !tools.has_haproxy() {
             apt::install(workspace, &[HAPROXY])?;
         }
+        if !tools.has_openssl() {
+            apt::install(workspace, &[OPENSSL])?;
+        }
         clients::install(workspace)?;
         if !has_postgresql(Path::new(POSTGRESQL_PROGRAMS)) {
             apt::install(workspace, &[POSTGRESQL])?;
@@ -119,6 +130,11 @@ impl Tools {
 
     fn has_haproxy(&self) -> bool {
         run::quietly(Command::new(&self.haproxy).arg("-v"))
+    }
+
+    fn has_openssl(&self) -> bool {
+        let version = run::output(Command::new(&self.openssl).arg("version"));
+        version.is_some_and(|version| version.strip_prefix("OpenSSL ").is_some_and(|v| v >= "3"))
     }
 
     fn has_strace(&self) -> bool {
@@ -133,6 +149,7 @@ impl Tools {
         command.env("MIDSHIFT_TEST_STRACE", &self.strace);
         command.env("MIDSHIFT_TEST_HAPROXY", &self.haproxy);
         command.env("MIDSHIFT_TEST_NODE", &self.node);
+        command.env("MIDSHIFT_TEST_OPENSSL", &self.openssl);
     }
 }
 

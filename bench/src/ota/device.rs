@@ -1,6 +1,6 @@
 //! P9 on the robot's side: how short the way from one release to the next is, and what a download that is cut off costs ([`super::resume`]).
 //!
-//! Encoding is what the server calls, [`midshift_bundle::encoding`]; decoding is what a robot calls, [`DiskSets`], with all it checks.
+//! Encoding is what `bundle sign` calls, [`midshift_bundle::encoding`]; decoding is what a robot calls, [`DiskSets`], with all it checks.
 
 use super::programs;
 use super::resume::{self, ResumeArgs};
@@ -128,7 +128,7 @@ fn ways(pair: &str, old: &[u8], new: &[u8], room: &Path) -> anyhow::Result<Vec<F
         figures.extend([
             Figure::of("P9", name(word), "KiB", &[kib(way.len())], beside_whole),
             Figure::of("P9", name(&format!("{word}, share")), "%", &[kib(way.len()) * 100.0 / median(&whole)], None),
-            Figure::of("P9", name(&format!("{word}, made by the server")), "s", &encode_s, sha),
+            Figure::of("P9", name(&format!("{word}, made by who signs")), "s", &encode_s, sha),
             Figure::of("P9", name(&format!("{word}, undone in memory")), "s", &decode_s, copy),
             Figure::of("P9", name(&format!("{word}, applied by a robot")), "s", &apply_s, disk),
         ]);

@@ -68,10 +68,11 @@ fn a_release_of_two_people_waits_for_the_second() {
     assert_eq!(folder.check().expect("whole").targets_version, None, "nobody believes it yet");
     let other = folder.add(&bundle(place.path(), "1.1.0", b"two"), &[&key(place.path(), "targets-1.pem")], START);
     assert!(matches!(other, Err(Error::Refused(_))), "one document waits at a time");
-    assert_eq!(folder.cosign(&[&key(place.path(), "root-1.pem")]).expect("a key of another role"), Signed::Pending);
-    assert_eq!(folder.cosign(&[&key(place.path(), "targets-3.pem")]).expect("the second"), Signed::Published(1));
+    let of_another_role = folder.cosign(&[&key(place.path(), "root-1.pem")], &[]);
+    assert!(matches!(of_another_role, Err(Error::Refused(_))), "it is not asked for");
+    assert_eq!(folder.cosign(&[&key(place.path(), "targets-3.pem")], &[]).expect("the second"), Signed::Published(1));
     assert_eq!(folder.check().expect("whole").bundles.len(), 1);
-    assert!(folder.cosign(&[&key(place.path(), "targets-2.pem")]).is_err(), "none waits any more");
+    assert!(folder.cosign(&[&key(place.path(), "targets-2.pem")], &[]).is_err(), "none waits any more");
 }
 
 #[test]

@@ -1,5 +1,4 @@
-//! Takes away files that nothing needs any more: what was brought and never published, what was withdrawn and nobody names, what was made
-//! of either.
+//! Takes away files that nothing needs any more: what was brought and never published, what was withdrawn and nobody names.
 //!
 //! Called by the service whenever its planner says what is named. Invariant: a file stays that the newest release lists, that a named bundle
 //! consists of, or that was not unnamed all through [`Room::unnamed_ms`] of serving time; nothing is published while files are taken
@@ -7,7 +6,6 @@
 
 use crate::content::{Content, Room};
 use crate::disk::write_whole;
-use crate::encodings::Encodings;
 use crate::repository::{Error, Repository};
 use crate::{blocking, content};
 use midshift_bundle::digest::Digest;
@@ -38,11 +36,7 @@ pub struct Collected {
     pub files: u64,
     /// Their bytes.
     pub file_bytes: u64,
-    /// Shorter ways that were taken away.
-    pub encodings: u64,
-    /// Their bytes.
-    pub encoding_bytes: u64,
-    /// Files and shorter ways that could not be taken away. They are tried again.
+    /// Files that could not be taken away. They are tried again.
     pub failed: u64,
     /// Bytes of files that nothing names and whose time is not over.
     pub unnamed_bytes: u64,
@@ -111,14 +105,12 @@ impl Collector {
     pub async fn collect(
         &self,
         content: &dyn Content,
-        encodings: &Encodings,
         repository: &Repository,
         named: &Named,
         at: Utc,
     ) -> Result<Collected, Error> {
         let (newest, guard) = repository.still().await?;
-        let listed = newest.map(|newest| newest.digests().clone()).unwrap_or_default();
-        let mut kept = listed.clone();
+        let mut kept = newest.map(|newest| newest.digests().clone()).unwrap_or_default();
         for bundle in &named.bundles {
             let Ok(digest) = bundle.as_str().parse() else { continue };
             kept.extend(repository.files_of(digest).await?.unwrap_or_default());
@@ -129,9 +121,6 @@ impl Collector {
         marks.since = blocking(move || read(&path)).await?;
         let mut done = Collected::default();
         let served_ms = named.served_ms;
-        // What can be made again goes first, and at once.
-        let swept = encodings.sweep(listed, kept.clone(), served_ms, self.room.unnamed_ms).await;
-        (done.encodings, done.encoding_bytes, done.failed) = (swept.ways, swept.bytes, swept.failed);
         let mut since = BTreeMap::new();
         let seen = marks.touched;
         for stored in content.list().await? {
@@ -177,22 +166,12 @@ impl Collected {
     /// Says it to whoever watches the server.
     pub fn tell(&self, at: Utc) {
         metrics::counter!("midshift_ota_collected_total", "what" => "file").increment(self.files);
-        metrics::counter!("midshift_ota_collected_total", "what" => "encoding").increment(self.encodings);
         metrics::counter!("midshift_ota_collected_bytes_total", "what" => "file").increment(self.file_bytes);
-        metrics::counter!("midshift_ota_collected_bytes_total", "what" => "encoding").increment(self.encoding_bytes);
         metrics::gauge!("midshift_ota_unnamed_bytes").set(self.unnamed_bytes as f64);
         metrics::gauge!("midshift_ota_collect_time_seconds").set((at.0 / 1_000) as f64);
-        let Self { files, file_bytes, encodings, encoding_bytes, failed, unnamed_bytes } = *self;
-        if files + encodings + failed > 0 {
-            tracing::info!(
-                files,
-                file_bytes,
-                encodings,
-                encoding_bytes,
-                failed,
-                unnamed_bytes,
-                "software that nobody needs was taken away"
-            );
+        let Self { files, file_bytes, failed, unnamed_bytes } = *self;
+        if files + failed > 0 {
+            tracing::info!(files, file_bytes, failed, unnamed_bytes, "software that nobody needs was taken away");
         } else {
             tracing::debug!(unnamed_bytes, "there was no software that nobody needs");
         }

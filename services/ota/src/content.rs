@@ -13,7 +13,6 @@ use crate::{blocking, is_of_one_thread};
 use async_trait::async_trait;
 use bytes::Bytes;
 use midshift_bundle::digest::{Digest, Hashing};
-use midshift_bundle::encoding::Base;
 use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
 use midshift_core::limits;
 use serde::{Deserialize, Serialize};
@@ -88,17 +87,6 @@ pub enum Held {
 /// Bytes of a range, in order.
 pub type Reader = Box<dyn AsyncRead + Send + Unpin>;
 
-impl Error {
-    /// Bytes that would have to become free first; none: room is not what is missing.
-    pub const fn lacking(&self) -> Option<u64> {
-        match self {
-            Self::Full { missing, free, .. } => Some(missing.saturating_sub(*free)),
-            Self::DiskFull { missing, free, spare } => Some(missing.saturating_sub(free.saturating_sub(*spare))),
-            _ => None,
-        }
-    }
-}
-
 /// Where files of releases are kept.
 #[async_trait]
 pub trait Content: Send + Sync + 'static {
@@ -111,8 +99,6 @@ pub trait Content: Send + Sync + 'static {
     async fn settle(&self, file: Wanted) -> Result<Held, Error>;
     /// Bytes of a whole file, cut at its end; none: it is not here.
     async fn read(&self, digest: Digest, range: Range<u64>) -> Result<Option<Reader>, Error>;
-    /// A whole file, to be read from any place; none: it is not here.
-    async fn open(&self, digest: Digest) -> Result<Option<Box<dyn Base>>, Error>;
     /// Every file that is here, whole or not, by digest.
     async fn list(&self) -> Result<Vec<Stored>, Error>;
     /// Takes a file away, whole or not, and says how many bytes that were. 0: it is not here, or a piece is being added to it. Whoever has
@@ -120,10 +106,6 @@ pub trait Content: Send + Sync + 'static {
     async fn remove(&self, digest: Digest) -> Result<u64, Error>;
     /// How full it is.
     fn fill(&self) -> Fill;
-    /// Takes room for what is made of files, beside them.
-    fn claim(&self, bytes: u64) -> Result<(), Error>;
-    /// Gives such room back.
-    fn give_back(&self, bytes: u64);
 }
 
 /// What is known for sure of a file that is not whole, beside it as `<digest>.mark`.
@@ -178,18 +160,14 @@ pub struct Sharing {
     pub number: u64,
     /// Nobody else works in the folder yet.
     pub is_first: bool,
-    /// Folder of what is made of files: its bytes count too.
-    pub beside: PathBuf,
 }
 
 #[derive(Default)]
 struct Shelf {
     whole: BTreeMap<Digest, Whole>,
     parts: BTreeMap<Digest, Entry>,
-    /// Bytes of all files, whole or not, and of what was made of them.
+    /// Bytes of all files, whole or not.
     used: u64,
-    /// Bytes of that for what is being made now, in a shared folder.
-    claimed: u64,
     /// Rises with each touch of a file by whoever brings it.
     turn: u64,
 }
@@ -313,10 +291,6 @@ impl Content for DiskContent {
         }
         Ok(Some(Box::new(AsyncReadExt::take(tokio::fs::File::from_std(file), length))))
     }
-    async fn open(&self, digest: Digest) -> Result<Option<Box<dyn Base>>, Error> {
-        let opened = self.opened(digest, 0).await?;
-        Ok(opened.map(|file| -> Box<dyn Base> { Box::new(file) }))
-    }
     async fn list(&self) -> Result<Vec<Stored>, Error> {
         if matches!(self.inner.hand, Hand::Alone) {
             return Ok(self.inner.list());
@@ -328,16 +302,6 @@ impl Content for DiskContent {
     }
     fn fill(&self) -> Fill {
         Fill { used_bytes: self.inner.shelf().used, quota_bytes: self.inner.room.quota_bytes }
-    }
-    fn claim(&self, bytes: u64) -> Result<(), Error> {
-        self.inner.reserve(bytes, bytes)?;
-        self.inner.shelf().claimed += bytes;
-        Ok(())
-    }
-    fn give_back(&self, bytes: u64) {
-        let mut shelf = self.inner.shelf();
-        shelf.used = shelf.used.saturating_sub(bytes);
-        shelf.claimed = shelf.claimed.saturating_sub(bytes);
     }
 }
 

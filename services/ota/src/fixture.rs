@@ -82,6 +82,16 @@ pub fn files(name: &str, version: &str) -> Vec<(String, Vec<u8>)> {
     vec![(manifest.target(), manifest.to_bytes()), (manifest.components[0].target(), content)]
 }
 
+/// Bytes that do not become shorter by themselves.
+pub fn noise(seed: u64, length: usize) -> Vec<u8> {
+    let mut state = seed;
+    let step = |_| {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 56) as u8
+    };
+    (0..length).map(step).collect()
+}
+
 /// A set of directive keys of these seeds as a file of the repository, signed by the key of seed `by`.
 pub fn key_set(number: u64, seeds: &[u8], by: u8) -> (String, Vec<u8>) {
     let set = KeySet { number, keys: seeds.iter().map(|seed| key(*seed).public()).collect() };

@@ -26,8 +26,6 @@ const IN_USE: &str = "in-use.lock";
 pub const CONTENT: &str = "content.lock";
 /// Locked by whoever changes documents, or must not have them changed.
 pub const METADATA: &str = "metadata.lock";
-/// Locked by whoever makes shorter ways.
-pub const ENCODED: &str = "encoded.lock";
 /// What a new file system has by itself.
 const LOST_AND_FOUND: &str = "lost+found";
 /// Between two looks at a lock that another process holds.

@@ -1,6 +1,6 @@
 //! The gRPC face of releases: decode, call, encode. That of bytes is at the hatch.
 
-use crate::content::{Error, Held, Wanted};
+use crate::content::{Held, Wanted};
 use crate::repository::Act;
 use crate::{OtaService, pages, refusal};
 use bytes::Bytes;
@@ -57,15 +57,7 @@ impl OtaService {
             return Ok(());
         }
         let (opened, data) = (self.opened()?, Bytes::from(message.data));
-        let appended = opened.content.append(file, message.offset, data.clone()).await;
-        let lacking = appended.as_ref().err().and_then(Error::lacking);
-        // What can be made again makes room.
-        if let Some(lacking) = lacking
-            && opened.encodings.make_room(lacking).await
-        {
-            return Ok(opened.content.append(file, message.offset, data).await?);
-        }
-        Ok(appended?)
+        Ok(opened.content.append(file, message.offset, data).await?)
     }
 
     async fn uploaded(&self, file: Wanted) -> Result<v1::UploadTargetResponse, Refusal> {
@@ -91,7 +83,8 @@ impl OtaService {
         opened.repository.documents().look_if_possible().await;
         let newest = opened.repository.newest();
         let releases = newest.as_ref().map(|newest| newest.releases.as_slice()).unwrap_or_default();
-        let room = pages::room(opened.content.fill(), opened.encodings.bytes(), opened.collector.newest());
+        let way_bytes = newest.as_ref().map_or(0, |newest| newest.way_bytes());
+        let room = pages::room(opened.content.fill(), way_bytes, opened.collector.newest());
         let page = pages::page(releases, room, r).map_err(|bad| Refusal::invalid(bad.0))?;
         let keyless = opened.repository.directive_key().err().map(|keyless| shown(&keyless.reason()));
         Ok(v1::ListBundlesResponse { keyless, ..page })

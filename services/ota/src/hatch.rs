@@ -1,9 +1,9 @@
 //! Where bytes and documents are handed out, over gRPC to robots and over HTTP to others: from the folder of this process, or of others.
 //!
-//! Invariant: nothing is written or signed here, and only what the newest signed release lists is handed out, and what was made of that.
+//! Invariant: nothing is written or signed here, and only what the newest signed release lists is handed out. Shorter ways to files are listed like
+//! the files: they are made by whoever signs.
 
 use crate::content::{Content, Wanted};
-use crate::encodings::{Encodings, Way};
 use crate::grpc::{answer, status};
 use crate::integrity::Integrity;
 use crate::repository::Documents;
@@ -24,7 +24,6 @@ use tonic::{Request, Response, Status, Streaming};
 /// What is handed out.
 pub struct Shown {
     pub(crate) content: Arc<dyn Content>,
-    pub(crate) encodings: Encodings,
     pub(crate) documents: Documents,
     integrity: Integrity,
 }
@@ -43,9 +42,8 @@ impl Shown {
 }
 
 impl Hatch {
-    pub(crate) fn new(content: Arc<dyn Content>, encodings: Encodings, documents: Documents) -> Self {
-        let shown = Shown { content, encodings, documents, integrity: Integrity::default() };
-        Self { shown: Some(Arc::new(shown)) }
+    pub(crate) fn new(content: Arc<dyn Content>, documents: Documents) -> Self {
+        Self { shown: Some(Arc::new(Shown { content, documents, integrity: Integrity::default() })) }
     }
 
     /// Signed files that were found damaged since this was asked last.
@@ -88,7 +86,7 @@ impl Hatch {
     }
 
     async fn encoding(&self, r: v1::GetEncodingRequest) -> Result<v1::GetEncodingResponse, Refusal> {
-        let opened = self.shown()?;
+        let shown = self.shown()?;
         let mut bad = Violations::default();
         let digest = bad.take("digest", r.digest.parse::<Digest>());
         if r.base_digests.len() > limits::ENCODING_BASES_MAX {
@@ -100,22 +98,20 @@ impl Hatch {
         let digest = digest.ok_or_else(|| Refusal::field("digest", "is required"))?;
         let file = self.listed(digest).await?;
         let mut answer = v1::GetEncodingResponse { encoding: v1::Encoding::Identity.into(), ..Default::default() };
-        match opened.encodings.way(file, &bases).await? {
-            Way::Identity => {}
-            Way::Later => answer.ask_again_ms = limits::ENCODING_ASK_AGAIN_MS,
-            Way::Encoded(key, encoded) => {
-                let kind = if key.base.is_some() { v1::Encoding::ZstdPatch } else { v1::Encoding::Zstd };
-                answer.encoding = kind.into();
-                answer.base_digest = key.base.map(String::from).unwrap_or_default();
-                answer.encoded_digest = encoded.digest.to_string();
-                answer.encoded_length = encoded.length;
-            }
+        if let Some(newest) = shown.documents.newest()
+            && let Some((from, shorter)) = newest.way(file.digest, &bases)
+        {
+            let kind = if from.is_some() { v1::Encoding::ZstdPatch } else { v1::Encoding::Zstd };
+            answer.encoding = kind.into();
+            answer.base_digest = from.map(String::from).unwrap_or_default();
+            answer.encoded_digest = shorter.digest.to_string();
+            answer.encoded_length = shorter.length;
         }
         Ok(answer)
     }
 
     async fn fetch(&self, r: v1::FetchChunksRequest) -> Result<Chunks, Refusal> {
-        let opened = self.shown()?;
+        let shown = self.shown()?;
         let mut bad = Violations::default();
         let digest = bad.take("digest", r.digest.parse::<Digest>());
         if !(1..=limits::CHUNK_RANGE_BYTES).contains(&r.length) {
@@ -123,23 +119,12 @@ impl Hatch {
         }
         bad.finish()?;
         let digest = digest.ok_or_else(|| Refusal::field("digest", "is required"))?;
-        opened.encodings.follow().await?;
-        let encoded = opened.encodings.found(digest).filter(|(key, _)| opened.lists(key.target));
-        let length = match encoded {
-            Some(_) if !opened.integrity.holds_way(&opened.encodings, digest).await? => {
-                return Err(Refusal::new(Kind::NotFound, Code::SoftwareNotFound));
-            }
-            Some((_, length)) => length,
-            None => self.listed(digest).await?.length,
-        };
+        let length = self.listed(digest).await?.length;
         if r.offset >= length {
             return Err(Refusal::field("offset", format!("the file has {length} bytes")));
         }
         let range = r.offset..(r.offset + r.length).min(length);
-        let reader = match encoded {
-            Some(_) => opened.encodings.read(digest, range).await?,
-            None => opened.content.read(digest, range).await?,
-        };
+        let reader = shown.content.read(digest, range).await?;
         let reader = reader.ok_or_else(|| Refusal::new(Kind::NotFound, Code::SoftwareNotFound))?;
         let mut offset = r.offset;
         let stream = ReaderStream::with_capacity(reader, limits::CHUNK_BYTES).map(move |piece| {

@@ -1,17 +1,15 @@
-//! Hashes signed files and shorter ways to them before their bytes are handed out: the first time since the start, and again after a day.
+//! Hashes signed files before their bytes are handed out: the first time since the start, and again after a day.
 //!
 //! Called by the hatch. Invariant: a file whose bytes are not what its name says is handed out by nobody; where this process keeps the folder
-//! it is taken away, so that it can be pushed again, or made again.
+//! it is taken away, so that it can be pushed again.
 
-use crate::blocking;
 use crate::content::{Content, Error};
-use crate::encodings::Encodings;
-use midshift_bundle::digest::Digest;
-use midshift_bundle::encoding::Base;
-use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
+use midshift_bundle::digest::{Digest, Hashing};
+use midshift_core::limits;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
+use tokio::io::AsyncReadExt;
 use tokio::time::Instant;
 
 /// A whole file is hashed again after this.
@@ -37,10 +35,20 @@ impl Hashed {
     }
 }
 
-async fn is_whole(digest: Digest, mut file: Box<dyn Base>) -> Result<bool, Error> {
-    let found = blocking(move || Digest::of_reader(&mut file, COMPONENT_BYTES_MAX)).await;
-    let path = digest.to_string().into();
-    Ok(found.map_err(|source| Error::Io { doing: "hashing", path, source })?.0 == digest)
+/// Whether a file holds the bytes that its name says; none: it is not here.
+async fn is_whole(content: &dyn Content, digest: Digest) -> Result<Option<bool>, Error> {
+    let Some(length) = content.length(digest).await? else { return Ok(None) };
+    let Some(mut reader) = content.read(digest, 0..length).await? else { return Ok(None) };
+    let (mut hashing, mut piece) = (Hashing::default(), vec![0; limits::CHUNK_BYTES]);
+    loop {
+        let read = reader.read(&mut piece).await;
+        let path = || digest.to_string().into();
+        let bytes = read.map_err(|source| Error::Io { doing: "hashing", path: path(), source })?;
+        if bytes == 0 {
+            return Ok(Some(hashing.digest() == digest));
+        }
+        hashing.update(&piece[..bytes]);
+    }
 }
 
 /// One file. Who asks for it meanwhile waits until it is hashed.
@@ -76,8 +84,7 @@ impl Integrity {
         if let Some(hashed) = last.filter(Hashed::counts) {
             return Ok(hashed.is_whole);
         }
-        let Some(file) = content.open(digest).await? else { return Ok(false) };
-        let is_whole = is_whole(digest, file).await?;
+        let Some(is_whole) = is_whole(content, digest).await? else { return Ok(false) };
         if is_whole {
             *last = Some(Hashed::now(true));
             return Ok(true);
@@ -87,23 +94,6 @@ impl Integrity {
         // Where others keep the folder it stays, and they find it too.
         *last = content.remove(digest).await.is_err().then(|| Hashed::now(false));
         Ok(false)
-    }
-
-    /// Whether a shorter way that is here holds the bytes that its name says.
-    ///
-    /// # Errors
-    /// The disk's.
-    pub async fn holds_way(&self, encodings: &Encodings, digest: Digest) -> Result<bool, Error> {
-        let check = self.check(digest);
-        let mut last = check.lock().await;
-        if let Some(hashed) = last.filter(Hashed::counts) {
-            return Ok(hashed.is_whole);
-        }
-        let Some(file) = encodings.whole(digest).await? else { return Ok(false) };
-        let is_whole = is_whole(digest, file).await?;
-        let stays = is_whole || !encodings.discard(digest).await;
-        *last = stays.then(|| Hashed::now(is_whole));
-        Ok(is_whole)
     }
 
     /// Files that were found damaged since this was asked last.

@@ -2,7 +2,7 @@
 //!
 //! Called by the binary: [`OtaService::open`], its two gRPC faces, its pages over HTTP/1.1 and [`OtaService::run`]; and [`OtaReader`] where only
 //! bytes are handed out. Several processes may share one folder. Invariant: nothing is signed here that says what software is good; only files
-//! that the newest signed release lists are handed out, and what was made of them; none of those is ever taken away.
+//! that the newest signed release lists are handed out; none of those is ever taken away.
 
 mod collect;
 pub mod content;
@@ -10,7 +10,6 @@ pub mod content;
 #[path = "../../../tests/src/counted.rs"]
 mod counted;
 mod disk;
-pub mod encodings;
 #[cfg(test)]
 mod fixture;
 pub mod folder;
@@ -37,22 +36,18 @@ pub use retention::prune;
 
 use collect::{Collector, Named};
 use content::{Content, DiskContent, Room, Sharing};
-use encodings::{Encodings, Key};
 use folder::{Gate, Owner, Presence};
 use hatch::Hatch;
-use midshift_bundle::manifest::Component;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::task::raw::parse_version;
 use midshift_core::time::{Clock, Utc};
 use midshift_proto::ota::v1::bundle_service_server::BundleServiceServer;
 use midshift_proto::ota::v1::chunk_service_server::ChunkServiceServer;
 use midshift_store::StoreId;
-use repository::{Documents, Error, Newest, OnlineKeys, Repository};
-use std::collections::BTreeMap;
+use repository::{Documents, Error, OnlineKeys, Repository};
 use std::panic::resume_unwind;
 use std::path::PathBuf;
-use std::sync::{Arc, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::runtime::RuntimeFlavor;
 use tokio::sync::watch;
@@ -82,7 +77,6 @@ pub struct Parts {
 
 struct Opened {
     content: Arc<dyn Content>,
-    encodings: Encodings,
     repository: Repository,
     collector: Collector,
     /// What the planner said last of what is needed. None: it said nothing since the start.
@@ -115,20 +109,17 @@ impl OtaService {
         let sharing = presence.as_ref().filter(|_| matches!(owner, Owner::Shared { .. }));
         let sharing = sharing.map(|presence| (presence.number, presence.is_first));
         let of = folder.clone();
-        let (content, encodings, collector) = blocking(move || {
-            let (files, encoded) = (of.join("content"), of.join("encoded"));
+        let (content, collector) = blocking(move || {
+            let files = of.join("content");
             let collector = Collector::open(&of, room)?;
             let Some((number, is_first)) = sharing else {
                 let content: Arc<dyn Content> = Arc::new(DiskContent::open(&files, room)?);
-                let encodings = Encodings::open(&encoded, content.clone())?;
-                return Ok((content, encodings, collector));
+                return Ok((content, collector));
             };
             let gate = Gate::new(Some(of.join(folder::CONTENT)));
-            let sharing = Sharing { gate, number, is_first, beside: encoded.clone() };
+            let sharing = Sharing { gate, number, is_first };
             let content: Arc<dyn Content> = Arc::new(DiskContent::join(&files, room, sharing)?);
-            let making = Gate::new(Some(of.join(folder::ENCODED)));
-            let encodings = Encodings::join(&encoded, content.clone(), making, number, is_first)?;
-            Ok::<_, Error>((content, encodings, collector))
+            Ok::<_, Error>((content, collector))
         })
         .await?;
         if let Some(presence) = &presence {
@@ -141,9 +132,9 @@ impl OtaService {
             Repository::open(&metadata, keys, content.clone()).await?
         };
         let repository = repository.with_clock(clock.clone());
-        let hatch = Hatch::new(content.clone(), encodings.clone(), repository.documents().clone());
+        let hatch = Hatch::new(content.clone(), repository.documents().clone());
         let (named, leads) = (watch::Sender::new(None), watch::Sender::new(true));
-        let opened = Opened { content, encodings, repository, collector, named, leads, clock, hatch, presence };
+        let opened = Opened { content, repository, collector, named, leads, clock, hatch, presence };
         Ok(Self { opened: Some(Arc::new(opened)) })
     }
     /// A service of a server without keys: it touches no disk and answers every call with what to do.
@@ -169,13 +160,8 @@ impl OtaService {
     fn hatch(&self) -> Hatch {
         self.opened.as_ref().map(|opened| opened.hatch.clone()).unwrap_or_default()
     }
-    /// Keeps what was signed fresh, makes files shorter for robots, and takes away what nobody needs, until shutdown.
+    /// Keeps what was signed fresh, and takes away what nobody needs, until shutdown.
     pub async fn run(self, shutdown: CancellationToken) {
-        let making = async {
-            if let Some(opened) = &self.opened {
-                opened.encodings.run(&shutdown).await;
-            }
-        };
         let collecting = async {
             if let Some(opened) = &self.opened {
                 opened.keep_room(&shutdown).await;
@@ -186,7 +172,7 @@ impl OtaService {
                 opened.follow(&shutdown).await;
             }
         };
-        tokio::join!(self.keep_fresh(&shutdown), making, collecting, following);
+        tokio::join!(self.keep_fresh(&shutdown), collecting, following);
     }
     async fn keep_fresh(&self, shutdown: &CancellationToken) {
         let Some(opened) = &self.opened else { return shutdown.cancelled().await };
@@ -228,9 +214,8 @@ impl OtaReader {
         let of = folder.clone();
         blocking(move || folder::must_be_of(&of, &store_id)).await?;
         let content: Arc<dyn Content> = Arc::new(DiskContent::reading(&folder.join("content")));
-        let encodings = Encodings::reading(&folder.join("encoded"), content.clone());
         let documents = Documents::reading(&folder.join("metadata"), content.clone()).await?;
-        Ok(Self { hatch: Hatch::new(content, encodings, documents.clone()), documents })
+        Ok(Self { hatch: Hatch::new(content, documents.clone()), documents })
     }
     /// Documents, for robots: nothing else of releases is answered here.
     pub fn bundles(&self) -> BundleServiceServer<Hatch> {
@@ -265,46 +250,17 @@ async fn every_second<F: Future<Output = ()>>(shutdown: &CancellationToken, foll
     }
 }
 
-/// The ways that robots will ask for of files of a release, from the newest version of each component on: gateways do not ask.
-fn likely_ways(newest: &Newest) -> Vec<Key> {
-    let mut by_name: BTreeMap<&str, BTreeMap<(u64, u64, u64), &Component>> = BTreeMap::new();
-    for component in newest.releases.iter().flat_map(|release| &release.manifest.components) {
-        if let Some(version) = parse_version(&component.version) {
-            by_name.entry(&component.name).or_default().insert(version, component);
-        }
-    }
-    let mut keys = Vec::new();
-    for versions in by_name.values() {
-        let newest_first: Vec<&&Component> = versions.values().rev().collect();
-        for (age, target) in newest_first.iter().enumerate().filter(|(_, c)| encodings::is_worth_asking(c.length)) {
-            let before = newest_first[age + 1..].iter().filter(|base| base.digest != target.digest);
-            let bases = before.take(limits::ENCODING_BASES_AHEAD).map(|base| Some(base.digest));
-            keys.extend(bases.chain([None]).map(|base| (age, Key { target: target.digest, base })));
-        }
-    }
-    keys.sort_by_key(|(age, _)| *age);
-    keys.into_iter().map(|(_, key)| key).collect()
-}
-
 impl Opened {
     fn is_shared(&self) -> bool {
         self.presence.as_ref().is_some_and(Presence::is_shared)
     }
 
-    /// Tries files and keys again that could not be read, learns what other processes publish, and has made what robots will ask gateways for.
+    /// Tries files and keys again that could not be read, and learns what other processes publish.
     async fn follow(&self, shutdown: &CancellationToken) {
-        let wanted = std::sync::Mutex::new(0);
         every_second(shutdown, || async {
             self.repository.documents().follow_if_possible().await;
             // Said before this process has to sign.
             let _known = self.repository.find_directive_key().await;
-            let Some(newest) = self.repository.newest().filter(|_| self.is_shared()) else { return };
-            let version = newest.targets.edition.version;
-            let is_new =
-                std::mem::replace(&mut *wanted.lock().unwrap_or_else(PoisonError::into_inner), version) != version;
-            if is_new {
-                self.encodings.want(likely_ways(&newest));
-            }
         })
         .await;
     }
@@ -333,7 +289,7 @@ impl Opened {
             return;
         }
         let at = self.now();
-        match self.collector.collect(self.content.as_ref(), &self.encodings, &self.repository, named, at).await {
+        match self.collector.collect(self.content.as_ref(), &self.repository, named, at).await {
             Ok(collected) => collected.tell(at),
             Err(error) => tracing::error!(%error, "nobody knows which software is needed, so all of it is kept"),
         }

@@ -18,6 +18,7 @@ use midshift_bundle::key_set::KeySet;
 use midshift_bundle::keys::{self, SecretKey};
 use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::{self as people, FileTarget, Online, TIMESTAMP_LIFE_MS, listed, sign_online};
+use midshift_bundle::ways::Way;
 use midshift_core::identity::{Actor, TokenId};
 use midshift_core::reason::{Code, Reason, Refusal};
 use midshift_core::time::{Clock, Doubt, Utc};
@@ -350,6 +351,16 @@ impl Newest {
     /// Whether sets of directive keys are listed, readable or not.
     fn lists_sets(&self) -> bool {
         self.files.keys().any(|name| KeySet::number_of(name).is_some())
+    }
+    /// The shortest listed way to a file for a robot that has `bases`, the best first, and the one of them that it leads from.
+    pub fn way(&self, to: Digest, bases: &[Digest]) -> Option<(Option<Digest>, &FileTarget)> {
+        let mut ways = bases.iter().copied().map(Some).chain([None]);
+        ways.find_map(|from| Some((from, self.files.get(&Way { to, from }.target())?)))
+    }
+    /// Bytes of all listed ways that are shorter than the files they lead to.
+    pub fn way_bytes(&self) -> u64 {
+        let ways = self.files.iter().filter(|(name, _)| Way::of_target(name).is_some());
+        ways.map(|(_, file)| file.length).sum()
     }
     /// Whether a signed release has this file.
     pub fn lists(&self, digest: Digest) -> bool {

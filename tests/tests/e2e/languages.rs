@@ -68,6 +68,13 @@ impl Language {
             Self::TypeScript => anyhow::bail!("no program sends a batch"),
         }
     }
+    /// Signs a text with a key file.
+    pub fn signs(self, key: &Path, text: &str) -> anyhow::Result<Command> {
+        match self {
+            Self::Go => self.run("bin/keyfile", &[&key.to_string_lossy(), text]),
+            Self::Python | Self::TypeScript => anyhow::bail!("no program signs"),
+        }
+    }
     fn run(self, program: &str, arguments: &[&str]) -> anyhow::Result<Command> {
         let home = self.home()?;
         let mut command = match self {

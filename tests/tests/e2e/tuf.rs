@@ -110,6 +110,12 @@ elif part == "second":
     lies["2.targets.json"] = get("2.targets.json").replace(b"1.6.0", b"6.6.6")
     refused("targets that were tampered with", exceptions.RepositoryError, client("mixed", between).refresh)
     lies.clear()
+    lies["2.root.json"] = get("1.root.json")
+    refused("a root that is not the next", exceptions.BadVersionNumberError, client("mixed", between).refresh)
+    lies.clear()
+    lies["timestamp.json"] = get("timestamp.json") + b" " * 100_000
+    refused("a timestamp without an end", exceptions.DownloadError, client("mixed", between).refresh)
+    lies.clear()
     client("mixed", between).refresh()
     frozen = client("frozen")
     frozen._trusted_set.reference_time = datetime.datetime.now(datetime.timezone.utc) + datetime.timedelta(days=2)
@@ -120,6 +126,12 @@ elif part == "tampered":
     robot.refresh()
     assert download(robot, "gait-1.5.0.component") == b"walks"
     refused("a file that was tampered with", exceptions.RepositoryError, lambda: download(robot, "gait-1.6.0.component"))
+elif part == "follows":
+    robot = client("robot")
+    robot.refresh()
+    download(robot, "gait-1.0.0.component")
+    believed = robot._trusted_set
+    print(f"root {believed.root.version}, targets {believed.targets.version}")
 "#;
 
 /// Runs the program in `dir` and wants it to succeed.
@@ -129,29 +141,36 @@ fn release(dir: &Path, arguments: &[&str]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Builds and signs a bundle of one component, and brings it to the server.
-fn push(dir: &Path, server: &Server, version: &str, content: &str) -> anyhow::Result<()> {
+/// A folder to build a bundle of one component of; its name.
+pub fn draft(dir: &Path, version: &str, content: &str) -> anyhow::Result<String> {
     let draft = format!(
         "name = \"walk\"\nversion = \"{version}\"\n[[component]]\nname = \"gait\"\nversion = \"{version}\"\nkind = \"process\"\n\
          file = \"gait\"\nhardware = [\"h1\"]\nneeds = \"restart\"\n"
     );
-    let (folder, bundle) = (format!("draft-{version}"), format!("walk-{version}"));
+    let folder = format!("draft-{version}");
     std::fs::create_dir(dir.join(&folder))?;
     std::fs::write(dir.join(&folder).join("bundle.toml"), draft)?;
     std::fs::write(dir.join(&folder).join("gait"), content)?;
+    Ok(folder)
+}
+
+/// Builds and signs a bundle of one component, and brings it to the server.
+fn push(dir: &Path, server: &Server, version: &str, content: &str) -> anyhow::Result<()> {
+    let (folder, bundle) = (draft(dir, version, content)?, format!("walk-{version}"));
     release(dir, &["bundle", "build", &folder, "--out", &bundle])?;
     release(dir, &["bundle", "sign", &bundle, "--repository", "repository", "--key", "keys/targets-1.pem"])?;
     release(dir, &["bundle", "push", "repository", "--server", &server.address.to_string()])
 }
 
-fn python(dir: &Path, server: &Server, part: &str) -> anyhow::Result<Vec<String>> {
+/// What python-tuf says, which keeps what it believes in `work` and began with the first root of `repository`.
+pub fn python(dir: &Path, server: &Server, part: &str, repository: &str) -> anyhow::Result<Vec<String>> {
     let script = dir.join("robot.py");
     std::fs::write(&script, CLIENT)?;
     let mut command = Command::new(tool("MIDSHIFT_TEST_PYTHON")?);
     command.arg(&script).args([
         part,
         &format!("https://{}", server.address),
-        "repository/metadata/1.root.json",
+        &format!("{repository}/metadata/1.root.json"),
         "work",
     ]);
     sign_in(&mut command, server.address);
@@ -169,7 +188,7 @@ async fn python_tuf_takes_releases_and_refuses_lies() -> anyhow::Result<()> {
     let mut server = Server::start_with(dir, DEMO, &["--ota-keys", &keys.to_string_lossy()]).await?;
     push(dir, &server, "1.5.0", "walks")?;
     std::fs::create_dir(dir.join("work"))?;
-    assert_eq!(python(dir, &server, "first")?, Vec::<String>::new());
+    assert_eq!(python(dir, &server, "first", "repository")?, Vec::<String>::new());
     server.kill_and_restart().await?;
     push(dir, &server, "1.6.0", "runs")?;
     let refused = [
@@ -177,9 +196,11 @@ async fn python_tuf_takes_releases_and_refuses_lies() -> anyhow::Result<()> {
         "refused: a snapshot of another release",
         "refused: targets of another release",
         "refused: targets that were tampered with",
+        "refused: a root that is not the next",
+        "refused: a timestamp without an end",
         "refused: a timestamp that was frozen",
     ];
-    assert_eq!(python(dir, &server, "second")?, refused);
+    assert_eq!(python(dir, &server, "second", "repository")?, refused);
     let content = dir.join("data/ota/content");
     let mut tampered = 0;
     for entry in std::fs::read_dir(content)? {
@@ -190,6 +211,6 @@ async fn python_tuf_takes_releases_and_refuses_lies() -> anyhow::Result<()> {
         }
     }
     assert_eq!(tampered, 1);
-    assert_eq!(python(dir, &server, "tampered")?, ["refused: a file that was tampered with"]);
+    assert_eq!(python(dir, &server, "tampered", "repository")?, ["refused: a file that was tampered with"]);
     Ok(())
 }

@@ -1,5 +1,7 @@
 //! `midshift bundle …`: what release people do with keys and bundles. Only `push`, `ls` and `revoke` need a server.
 
+mod root;
+
 use super::client::{Call, Change, Exit};
 use super::out::{Format, Out};
 use super::{push, released};
@@ -13,6 +15,7 @@ use midshift_bundle::key_set::{ENVELOPE_BYTES_MAX, KeySet};
 use midshift_bundle::keys::{PublicKey, SecretKey};
 use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::Profile;
+use midshift_core::limits::SIGNED_DOCUMENT_BYTES;
 use std::fs::File;
 use std::io::{IsTerminal, Read};
 use std::path::{Path, PathBuf};
@@ -59,23 +62,52 @@ pub enum Verb {
     /// Add a bundle, or a set of directive keys, to the repository and sign it; or sign what waits for one more signature.
     Sign {
         /// The built bundle, or the file that `rekey` made.
-        #[arg(required_unless_present = "pending")]
+        #[arg(required_unless_present_any = ["pending", "renew"])]
         bundle: Option<PathBuf>,
         /// Sign what waits for signatures instead.
         #[arg(long, conflicts_with = "bundle")]
         pending: bool,
+        /// Sign what is listed already once more instead, for another year: after a change of root, or before it ends.
+        #[arg(long, conflicts_with_all = ["bundle", "pending"])]
+        renew: bool,
         /// The repository.
         #[arg(long)]
         repository: PathBuf,
         /// A secret key of targets; more than one if you hold more.
-        #[arg(long, required = true)]
+        #[arg(long, required_unless_present = "signature")]
         key: Vec<PathBuf>,
+        /// A release, as NAME-VERSION, from which robots come beside the newest three: what they lack is made and signed too, so that they fetch less.
+        #[arg(long, requires = "bundle")]
+        from: Vec<String>,
+        /// With --pending, what another person handed over: their pending.targets.json.
+        #[arg(long, requires = "pending")]
+        signature: Vec<PathBuf>,
         /// Sign only if the repository has all that this server shows, host:port, so that versions never fork.
         #[arg(long, conflicts_with = "upstream")]
         server: Option<String>,
         /// Sign only if the repository has all that this copy of it has.
         #[arg(long)]
         upstream: Option<PathBuf>,
+    },
+    /// Change who signs: a next root, that people of the one before and of its own sign where each of them is.
+    Root {
+        #[command(subcommand)]
+        verb: root::Verb,
+    },
+    /// Write the file that robots are given when they are set up: the newest root, whose orders they take, and the id of their site.
+    Trust {
+        /// The repository.
+        #[arg(long)]
+        repository: PathBuf,
+        /// A key that signs orders, secret or public, beside those of the set that the repository lists.
+        #[arg(long)]
+        directive: Vec<PathBuf>,
+        /// The id of the site.
+        #[arg(long)]
+        site: String,
+        /// The file.
+        #[arg(long)]
+        out: PathBuf,
     },
     /// Sign a release without a bundle, for good: robots that run it go on, and the server takes its files away some days after no roll-out and
     /// no robot names it any more. Push it afterwards.
@@ -172,14 +204,23 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Keygen { profile, keys, repository } => keygen(profile, &keys, &repository, out),
         Verb::Build { folder, out: into } => build_one(&folder, &into, out),
         Verb::Rekey { by, keys, number, out: into } => rekey(&by, &keys, number, &into, out),
-        Verb::Sign { bundle, pending: _, repository, key, server, upstream } => {
+        Verb::Root { verb } => root::run(verb, out),
+        Verb::Trust { repository, directive, site, out: into } => {
+            root::trust(&repository, &directive, &site, &into, out)
+        }
+        Verb::Sign { bundle, pending, renew: _, from, repository, key, signature, server, upstream } => {
             if let Some(server) = server {
                 push::has_all_of_server(Folder::open(&repository)?, &Call::to(server)).await?;
             }
             if let Some(copy) = upstream {
                 push::has_all_of_copy(&Folder::open(&repository)?, &Folder::open(&copy)?)?;
             }
-            sign(bundle.as_deref(), &repository, &key, out)
+            let what = match bundle {
+                Some(bundle) => What::New(bundle, from),
+                None if pending => What::Pending(handed(&signature)?),
+                None => What::Again,
+            };
+            sign(&what, &repository, &key, out)
         }
         Verb::Withdraw { bundle, repository, key } => withdraw(&bundle, &repository, &key, out),
         Verb::Samples { dir, program, config_only, repository, key } => {
@@ -238,17 +279,22 @@ fn read_keys(paths: &[PathBuf]) -> Result<Vec<SecretKey>, Exit> {
     Ok(paths.iter().map(|path| SecretKey::read(path)).collect::<Result<Vec<_>, _>>().map_err(Error::from)?)
 }
 
+/// A key of others by its file, secret or public. A file that is not there becomes a new secret key.
+fn public_key(path: &Path, out: &Out) -> Result<PublicKey, Exit> {
+    if !path.exists() {
+        let key = SecretKey::draw();
+        key.write(path).map_err(Error::from)?;
+        out.say(&format!("a new key, that only you can read: {}", path.display()));
+    }
+    let public = || SecretKey::read(path).map(|key| key.public());
+    Ok(PublicKey::read(path).or_else(|_| public()).map_err(Error::from)?)
+}
+
 fn rekey(by: &Path, keys: &[PathBuf], number: u64, into: &Path, out: &Out) -> Result<(), Exit> {
     let by = SecretKey::read(by).map_err(Error::from)?;
     let mut set = KeySet { number, keys: Vec::new() };
     for path in keys {
-        if !path.exists() {
-            let key = SecretKey::draw();
-            key.write(path).map_err(Error::from)?;
-            out.say(&format!("a new key, that only you can read: {}", path.display()));
-        }
-        let public = || SecretKey::read(path).map(|key| key.public());
-        set.keys.push(PublicKey::read(path).or_else(|_| public()).map_err(Error::from)?);
+        set.keys.push(public_key(path, out)?);
     }
     let envelope = set.sign(&by).map_err(Error::from)?;
     let written = midshift_durable::create(into, &envelope, midshift_durable::OPEN);
@@ -265,22 +311,48 @@ fn key_set(path: &Path) -> Result<Option<Vec<u8>>, Exit> {
     if path.is_dir() {
         return Ok(None);
     }
-    let mut bytes = Vec::new();
-    let read = File::open(path).and_then(|file| file.take(ENVELOPE_BYTES_MAX as u64 + 1).read_to_end(&mut bytes));
-    read.map_err(|source| Error::Io { doing: "reading", path: path.to_owned(), source })?;
-    Ok(Some(bytes))
+    Ok(Some(bytes_of(path, ENVELOPE_BYTES_MAX)?))
 }
 
-fn sign(bundle: Option<&Path>, repository: &Path, keys: &[PathBuf], out: &Out) -> Result<(), Exit> {
+/// The bytes of a file, and one more than `most` if it is longer.
+fn bytes_of(path: &Path, most: usize) -> Result<Vec<u8>, Exit> {
+    let mut bytes = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(most as u64 + 1).read_to_end(&mut bytes));
+    read.map_err(|source| Error::Io { doing: "reading", path: path.to_owned(), source })?;
+    Ok(bytes)
+}
+
+/// Signed documents and bare signatures that others handed over.
+fn handed(paths: &[PathBuf]) -> Result<Vec<Vec<u8>>, Exit> {
+    let read = |path: &PathBuf| {
+        let bytes = bytes_of(path, SIGNED_DOCUMENT_BYTES)?;
+        let is_one = bytes.len() <= SIGNED_DOCUMENT_BYTES;
+        is_one.then_some(bytes).ok_or_else(|| Exit::usage(format!("{} is too long for a signature", path.display())))
+    };
+    paths.iter().map(read).collect()
+}
+
+/// What is signed.
+enum What {
+    /// This bundle, with patches from these releases too; or this set of directive keys.
+    New(PathBuf, Vec<String>),
+    /// What waits, with what others handed over.
+    Pending(Vec<Vec<u8>>),
+    /// What was signed before.
+    Again,
+}
+
+fn sign(what: &What, repository: &Path, keys: &[PathBuf], out: &Out) -> Result<(), Exit> {
     let folder = Folder::open(repository)?;
     let keys = read_keys(keys)?;
     let keys: Vec<&SecretKey> = keys.iter().collect();
-    let signed = match bundle {
-        Some(bundle) => match key_set(bundle)? {
+    let signed = match what {
+        What::New(bundle, from) => match key_set(bundle)? {
             Some(set) => folder.add_keys(&set, &keys, clock::wall())?.1,
-            None => folder.add(bundle, &keys, clock::wall())?.1,
+            None => folder.add_with_ways(bundle, from, &keys, clock::wall())?.1,
         },
-        None => folder.cosign(&keys)?,
+        What::Pending(handed) => folder.cosign(&keys, handed)?,
+        What::Again => folder.renew(&keys, clock::wall())?,
     };
     tell_signed(signed, repository, out);
     Ok(())

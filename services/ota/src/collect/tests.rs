@@ -2,8 +2,6 @@
 
 use super::{Collected, Collector, Named, UNNAMED};
 use crate::content::{Content, DiskContent, Error, Held, Room, Wanted};
-use crate::encodings::tests::programs;
-use crate::encodings::{Encodings, Way};
 use crate::fixture::{SEEDS, START, bundle, first_root, key, target, write_keys};
 use crate::repository::{Act, OnlineKeys, Repository};
 use bytes::Bytes;
@@ -30,7 +28,6 @@ struct Shop {
     dir: TempDir,
     room: Room,
     content: Arc<DiskContent>,
-    encodings: Encodings,
     repository: Repository,
     collector: Collector,
     named: Named,
@@ -45,10 +42,9 @@ impl Shop {
     async fn open(dir: TempDir, room: Room, named: Named) -> Self {
         let keys = OnlineKeys::read(&dir.path().join("keys")).expect("keys");
         let content = Arc::new(DiskContent::open(&dir.path().join("content"), room).expect("a store"));
-        let encodings = Encodings::open(&dir.path().join("encoded"), content.clone()).expect("a shelf");
         let repository = Repository::open(&dir.path().join("metadata"), keys, content.clone()).await;
         let collector = Collector::open(dir.path(), room).expect("marks");
-        Self { repository: repository.expect("a repository"), dir, room, content, encodings, collector, named }
+        Self { repository: repository.expect("a repository"), dir, room, content, collector, named }
     }
     /// What a new process finds.
     async fn restarted(self) -> Self {
@@ -93,7 +89,7 @@ impl Shop {
     }
     async fn pass(&self) -> Result<Collected, crate::repository::Error> {
         let content = self.content.as_ref();
-        self.collector.collect(content, &self.encodings, &self.repository, &self.named, START).await
+        self.collector.collect(content, &self.repository, &self.named, START).await
     }
     /// A pass after so many milliseconds of serving.
     async fn after(&mut self, ms: u64) -> Collected {
@@ -215,17 +211,17 @@ async fn an_upload_that_goes_on_is_not_cut_and_one_that_was_left_alone_begins_an
     assert_eq!(shop.bring(&content).await.expect("brought anew"), Held::Whole);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn who_has_begun_to_read_reads_on() {
     let mut shop = Shop::new(1 << 20).await;
     let content = vec![9; 100_000];
     shop.bring(&content).await.expect("room");
     let digest = Digest::of(&content);
-    let mut handle = shop.content.open(digest).await.expect("readable").expect("there");
+    let mut handle = shop.content.read(digest, 0..100_000).await.expect("readable").expect("there");
     shop.after(1).await;
     assert_eq!(shop.after(TIME).await.file_bytes, 100_000);
     let mut found = Vec::new();
-    std::io::Read::read_to_end(&mut handle, &mut found).expect("its bytes");
+    handle.read_to_end(&mut found).await.expect("its bytes");
     assert_eq!(found, content);
     assert!(shop.content.read(digest, 0..1).await.expect("asked").is_none(), "nobody begins any more");
 }
@@ -308,73 +304,21 @@ async fn a_robot_that_names_a_file_that_is_no_bundle_keeps_that_file_and_stops_n
 }
 
 #[tokio::test]
-async fn a_shorter_way_that_the_disk_holds_on_to_stops_no_pass_and_its_room_is_given_back_when_it_goes() {
+async fn a_file_that_the_disk_holds_on_to_stops_no_pass_and_goes_when_it_can() {
     let mut shop = Shop::new(1 << 20).await;
-    let (old, new) = programs();
-    let one = with("1.0.0", &[("old-program", &old), ("new-program", &new)]);
-    shop.release(&[&one]).await;
-    shop.bring(b"stray").await.expect("room");
-    let (old, new) = (wanted(&old), wanted(&new));
-    shop.encodings.way(new, &[old.digest]).await.expect("asked");
-    while shop.encodings.make_next().await {}
-    let files_bytes = bytes_in(&shop.dir.path().join("content"));
-    let ways_bytes = shop.encodings.bytes();
-    assert_eq!(shop.content.fill().used_bytes, files_bytes + ways_bytes);
-    let Way::Encoded(key, patch) = shop.encodings.way(new, &[old.digest]).await.expect("asked") else { panic!() };
-    assert_eq!(key.base, Some(old.digest));
-    shop.after(TIME).await;
+    for content in [b"stuck", b"stray"] {
+        shop.bring(content).await.expect("room");
+    }
+    shop.after(1).await;
     // No file can be removed where a folder with something in it is.
-    let folder = shop.dir.path().join("encoded");
-    let entries = fs::read_dir(&folder).expect("a folder").map(|entry| entry.expect("an entry").path());
-    let stuck = entries.into_iter().find(|path| path.metadata().expect("a file").len() == patch.length);
-    let stuck = stuck.expect("the patch");
-    fs::remove_file(&stuck).expect("gone");
-    fs::create_dir_all(stuck.join("in-the-way")).expect("a folder");
-    shop.after(TIME).await;
-    assert_eq!(shop.after(TIME).await.failed, 1);
+    let path = shop.dir.path().join("content").join(Digest::of(b"stuck").to_string());
+    fs::remove_file(&path).expect("gone");
+    fs::create_dir_all(path.join("in-the-way")).expect("a folder");
+    let done = shop.after(TIME).await;
+    assert_eq!((done.files, done.failed, done.unnamed_bytes), (1, 1, 5));
     assert!(!shop.has(b"stray").await, "the pass went to its end");
-    assert_eq!(shop.encodings.bytes(), patch.length, "the other went");
-    let files_bytes = files_bytes - b"stray".len() as u64;
-    assert_eq!(shop.content.fill().used_bytes, files_bytes + patch.length, "what stays is counted");
-    assert!(!shop.encodings.make_room(1).await, "it cannot be had");
-    fs::remove_dir_all(&stuck).expect("gone");
-    // Gone without us: its room is free.
+    fs::remove_dir_all(&path).expect("gone");
+    fs::write(&path, b"stuck").expect("back");
     let done = shop.after(0).await;
-    assert_eq!((done.failed, done.encodings, shop.encodings.bytes()), (0, 1, 0));
-    assert_eq!(shop.content.fill().used_bytes, files_bytes);
-}
-
-#[tokio::test]
-async fn shorter_ways_go_first_and_are_made_again() {
-    let mut shop = Shop::new(1 << 20).await;
-    let (old, new) = programs();
-    let (one, two) = (with("1.0.0", &[("old-program", &old)]), with("2.0.0", &[("new-program", &new)]));
-    shop.release(&[&one, &two]).await;
-    let (old, new) = (wanted(&old), wanted(&new));
-    let made = async |shop: &Shop| {
-        shop.encodings.way(new, &[old.digest]).await.expect("asked");
-        while shop.encodings.make_next().await {}
-        let way = shop.encodings.way(new, &[old.digest]).await.expect("asked");
-        assert!(matches!(way, Way::Encoded(key, _) if key.base == Some(old.digest)), "{way:?}");
-    };
-    made(&shop).await;
-    assert_eq!(shop.after(TIME).await, Collected::default(), "both lead from and to what is listed");
-    shop.encodings.way(new, &[old.digest]).await.expect("asked");
-    assert_eq!(shop.after(TIME).await.encodings, 0, "they were used meanwhile");
-    assert_eq!(shop.after(TIME - 1).await.encodings, 0);
-    assert_eq!(shop.after(1).await.encodings, 2, "and now for a while they were not");
-    made(&shop).await;
-    // The base of the patch is withdrawn: no robot has it any more, and nobody may fetch it.
-    shop.publish(&[&two]).await.expect("withdrawn");
-    let done = shop.after(1).await;
-    assert_eq!((done.encodings, done.files), (1, 0));
-    let way = shop.encodings.way(new, &[]).await.expect("asked");
-    assert!(matches!(way, Way::Encoded(key, _) if key.base.is_none()), "{way:?}");
-    shop.name(&[&one]);
-    made(&shop).await;
-    assert_eq!(shop.after(1).await.encodings, 0, "a robot has it, so it is patched from it");
-    shop.publish(&[&one]).await.expect("the other is withdrawn");
-    assert_eq!(shop.after(1).await.encodings, 2, "nobody may fetch what they lead to");
-    assert_eq!(shop.encodings.bytes(), 0);
-    assert_eq!(bytes_in(&shop.dir.path().join("encoded")), 0);
+    assert_eq!((done.files, done.failed, done.unnamed_bytes), (1, 0, 0));
 }

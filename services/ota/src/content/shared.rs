@@ -118,14 +118,13 @@ impl Inner {
     pub(super) fn look(&self) -> Result<(), Error> {
         let Hand::Shared(sharing) = &self.hand else { return Ok(()) };
         let found = there(&self.path)?;
-        let made: u64 = there(&sharing.beside)?.values().map(|file| file.length).sum();
         let mut shelf = self.shelf();
         let wholes = found.iter().filter_map(|(name, file)| Some((name.parse::<Digest>().ok()?, file)));
         let is_new = take_wholes(&mut shelf, wholes.collect());
         self.take_parts(&mut shelf, sharing.number, &found)?;
         let parts = shelf.parts.values().map(|entry| entry.part.lock().unwrap_or_else(PoisonError::into_inner).written);
         let whole = shelf.whole.values().map(|whole| whole.length);
-        shelf.used = whole.chain(parts).sum::<u64>() + made + shelf.claimed;
+        shelf.used = whole.chain(parts).sum();
         drop(shelf);
         // Whoever named it may have died before the name was durable.
         if is_new { sync_folder(&self.path) } else { Ok(()) }

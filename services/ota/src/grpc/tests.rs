@@ -1,9 +1,9 @@
 //! The two services as callers meet them, over a real connection.
 
 use crate::OtaService;
-use crate::encodings::tests::programs;
 use crate::fixture::{SEEDS, files, first_root, release, service, targets};
 use midshift_bundle::digest::Digest;
+use midshift_bundle::ways::Way;
 use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::reason::Code;
@@ -248,42 +248,37 @@ async fn a_server_without_keys_says_what_to_do() {
 }
 
 #[tokio::test]
-async fn a_robot_is_told_of_a_patch_and_fetches_it_in_ranges_and_uploads_push_it_out() {
+async fn a_robot_is_told_of_the_patch_that_is_listed_for_it_and_another_of_the_whole_and_nothing_else_is_made() {
     let mut world = world().await;
-    let (old, new) = programs();
-    release(
-        &world.service,
-        &[("gait-1.component".to_owned(), old.clone()), ("gait-2.component".to_owned(), new.clone())],
-    )
-    .await;
-    let [base, digest] = [&old, &new].map(|content| Digest::of(content).to_string());
-    let request = v1::GetEncodingRequest { digest: digest.clone(), base_digests: vec![base.clone()] };
-    let told = world.chunks.get_encoding(request.clone()).await.expect("told").into_inner();
-    assert_eq!((told.encoding(), told.ask_again_ms), (v1::Encoding::Identity, limits::ENCODING_ASK_AGAIN_MS));
-    let encodings = &world.service.opened().expect("keys").encodings;
-    while encodings.make_next().await {}
-    let told = world.chunks.get_encoding(request).await.expect("told").into_inner();
-    assert_eq!((told.encoding(), told.ask_again_ms, told.base_digest), (v1::Encoding::ZstdPatch, 0, base));
+    let [old, new, other] = [b"old".as_slice(), b"new", b"other"].map(Digest::of);
+    let named = |from| Way { to: new, from }.target();
+    let patch = b"what the old one lacks".to_vec();
+    let listed = [
+        ("gait-1.component".to_owned(), b"old".to_vec()),
+        ("gait-2.component".to_owned(), b"new".to_vec()),
+        (named(Some(old)), patch.clone()),
+        (named(None), b"shorter".to_vec()),
+    ];
+    release(&world.service, &listed).await;
+    let mut way = async |digest: Digest, bases: &[Digest]| {
+        let base_digests = bases.iter().map(Digest::to_string).collect();
+        let request = v1::GetEncodingRequest { digest: digest.to_string(), base_digests };
+        world.chunks.get_encoding(request).await.expect("told").into_inner()
+    };
+    let told = way(new, &[other, old]).await;
+    assert_eq!((told.encoding(), told.ask_again_ms), (v1::Encoding::ZstdPatch, 0));
+    assert_eq!((told.base_digest, told.encoded_length), (old.to_string(), patch.len() as u64));
+    let whole = way(new, &[other]).await;
+    assert_eq!((whole.encoding(), whole.base_digest.as_str()), (v1::Encoding::Zstd, ""));
+    let none = way(old, &[new]).await;
+    assert_eq!((none.encoding(), none.ask_again_ms), (v1::Encoding::Identity, 0), "nobody makes one");
+    let request = v1::FetchChunksRequest { digest: told.encoded_digest, offset: 0, length: told.encoded_length };
+    let mut stream = world.chunks.fetch_chunks(request).await.expect("a range").into_inner();
     let mut bytes = Vec::new();
-    while (bytes.len() as u64) < told.encoded_length {
-        let request = v1::FetchChunksRequest {
-            digest: told.encoded_digest.clone(),
-            offset: bytes.len() as u64,
-            length: 1_000.min(told.encoded_length - bytes.len() as u64),
-        };
-        let mut stream = world.chunks.fetch_chunks(request).await.expect("a range").into_inner();
-        while let Some(chunk) = stream.message().await.expect("a piece") {
-            bytes.extend(chunk.data);
-        }
+    while let Some(chunk) = stream.message().await.expect("a piece") {
+        bytes.extend(chunk.data);
     }
-    assert_eq!(Digest::of(&bytes).to_string(), told.encoded_digest);
-    let opened = world.service.opened().expect("keys");
-    let free = (1 << 30) - (old.len() + new.len()) as u64;
-    opened.content.claim(free - 150_000).expect("leaves little");
-    let large = vec![7; 150_000];
-    world.upload(pieces(&large, 0, 1000)).await.expect("the ways made room for it");
-    let gone = v1::FetchChunksRequest { digest: told.encoded_digest, offset: 0, length: 1 };
-    assert_eq!(code(&world.chunks.fetch_chunks(gone).await.expect_err("it went")), Some(Code::SoftwareNotFound));
+    assert_eq!(bytes, patch);
 }
 
 #[tokio::test]

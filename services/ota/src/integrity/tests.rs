@@ -1,15 +1,12 @@
 //! Files that changed on the disk after they were brought.
 
-use super::{EVERY, Integrity};
+use super::EVERY;
 use crate::OtaService;
-use crate::content::{Content, DiskContent, Held, Room, Wanted};
-use crate::encodings::tests::programs;
-use crate::encodings::{Encodings, Way};
+use crate::content::{Held, Wanted};
 use crate::fixture::{files, release, service};
 use midshift_bundle::digest::Digest;
 use midshift_core::reason::Code;
 use std::path::PathBuf;
-use std::sync::Arc;
 use tempfile::TempDir;
 
 /// A service whose newest release lists this file, and where that lies.
@@ -59,30 +56,4 @@ async fn a_file_is_hashed_the_first_time_and_once_a_day() {
     opened.hatch.listed(digest).await.expect("it was hashed a moment ago");
     tokio::time::advance(EVERY).await;
     assert!(opened.hatch.listed(digest).await.is_err(), "a day later it is hashed again");
-}
-
-#[tokio::test]
-async fn a_shorter_way_that_was_damaged_is_not_handed_out_and_made_again() {
-    let dir = TempDir::new().expect("a folder");
-    let folder = dir.path().join("encoded");
-    let content = Arc::new(DiskContent::open(&dir.path().join("content"), Room::of(1 << 20)).expect("a store"));
-    let encodings = Encodings::open(&folder, content.clone()).expect("a shelf");
-    let (program, _) = programs();
-    let file = Wanted { digest: Digest::of(&program), length: program.len() as u64 };
-    content.append(file, 0, program.into()).await.expect("room");
-    content.settle(file).await.expect("whole");
-    let made = async || {
-        assert_eq!(encodings.way(file, &[]).await.expect("asked"), Way::Later);
-        assert!(encodings.make_next().await, "there was one to make");
-        let way = encodings.way(file, &[]).await.expect("asked");
-        let Way::Encoded(_, encoded) = way else { panic!("{way:?}") };
-        encoded.digest
-    };
-    let digest = made().await;
-    let path = std::fs::read_dir(&folder).expect("a folder").next().expect("a way").expect("an entry").path();
-    std::fs::write(path, b"something else").expect("damaged");
-    let integrity = Integrity::default();
-    assert!(!integrity.holds_way(&encodings, digest).await.expect("hashed"));
-    let again = made().await;
-    assert!(integrity.holds_way(&encodings, again).await.expect("hashed"));
 }

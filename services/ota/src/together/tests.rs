@@ -2,8 +2,7 @@
 
 use crate::collect::{Collected, Named};
 use crate::content::{Error, Held, Room, Wanted};
-use crate::encodings::tests::{noise, programs};
-use crate::fixture::{SEEDS, START, bundle, files, first_root, robot, root, targets, write_keys};
+use crate::fixture::{SEEDS, START, files, first_root, noise, robot, root, targets, write_keys};
 use crate::folder::Owner;
 use crate::hatch::Hatch;
 use crate::repository::{self, Act, FRESHEN_AFTER_MS};
@@ -12,6 +11,7 @@ use bytes::Bytes;
 use http::{Request as Get, StatusCode};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::repository::PEOPLE_LIFE_MS;
+use midshift_bundle::ways::Way;
 use midshift_core::time::{ScaledClock, Utc};
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::chunk_service_server::ChunkService;
@@ -22,7 +22,6 @@ use std::sync::Arc;
 use std::time::SystemTime;
 use tempfile::TempDir;
 use tokio_stream::StreamExt;
-use tokio_util::sync::CancellationToken;
 use tonic::{Code, Request, Status};
 use tower::ServiceExt;
 
@@ -217,16 +216,15 @@ async fn wrong_bytes_that_came_through_two_processes_are_thrown_away() {
 }
 
 #[tokio::test]
-async fn the_quota_is_one_for_all_processes_and_counts_what_is_made_of_files() {
+async fn the_quota_is_one_for_all_processes() {
     let site = Site::with_quota(100_000);
     let (one, two) = (site.process().await, site.process().await);
     bring(&one, &noise(7, 60_000)).await;
     let error = append(&two, &noise(8, 60_000), 0..1000).await.expect_err("full");
     assert!(matches!(error, Error::Full { missing: 60_000, used: 60_000, free: 40_000, .. }), "{error}");
-    fs::write(site.folder().join("encoded").join("made"), noise(9, 30_000)).expect("written");
-    let error = append(&two, &noise(8, 20_000), 0..1000).await.expect_err("full");
-    assert!(matches!(error, Error::Full { used: 90_000, free: 10_000, .. }), "{error}");
-    bring(&two, &noise(8, 10_000)).await;
+    bring(&two, &noise(8, 40_000)).await;
+    let error = append(&one, &noise(9, 1), 0..1).await.expect_err("full");
+    assert!(matches!(error, Error::Full { used: 100_000, free: 0, .. }), "{error}");
 }
 
 #[tokio::test]
@@ -347,7 +345,7 @@ async fn who_publishes_waits_for_the_one_that_takes_files_away() {
 async fn pass(service: &OtaService, served_ms: u64) -> Collected {
     let opened = opened(service);
     let named = Named { served_ms, ..Named::default() };
-    let pass = opened.collector.collect(opened.content.as_ref(), &opened.encodings, &opened.repository, &named, START);
+    let pass = opened.collector.collect(opened.content.as_ref(), &opened.repository, &named, START);
     pass.await.expect("a pass")
 }
 
@@ -465,48 +463,21 @@ async fn what_is_withdrawn_by_others_is_handed_out_no_more_once_the_gateway_foll
     assert_eq!(refused.code(), Code::NotFound);
 }
 
-/// A bundle of one component with these bytes.
-fn program(version: &str, content: &[u8]) -> Vec<(String, Vec<u8>)> {
-    let (mut manifest, _) = bundle("walk", version);
-    manifest.components[0].digest = Digest::of(content);
-    manifest.components[0].length = content.len() as u64;
-    vec![(manifest.target(), manifest.to_bytes()), (manifest.components[0].target(), content.to_vec())]
-}
-
-#[tokio::test(start_paused = true)]
-async fn patches_from_the_versions_before_are_made_unasked_and_a_gateway_gives_the_best_that_is_there() {
+#[tokio::test]
+async fn a_gateway_tells_robots_of_the_patches_that_are_listed() {
     let site = Site::new();
     let one = site.process().await;
-    let (old, new) = programs();
-    let (base, target) = (Digest::of(&old), Digest::of(&new));
-    let release = [program("1.0.0", &old), program("1.1.0", &new)].concat();
+    let [base, target] = [b"old".as_slice(), b"new"].map(Digest::of);
+    let patch = (Way { to: target, from: Some(base) }.target(), b"what it lacks".to_vec());
+    let release = [("gait-2.component".to_owned(), b"new".to_vec()), patch.clone()];
     publish(&one, None, &release, 0).await.expect("published");
     let reader = site.reader().await;
     let answer = encoding(&reader.hatch, target, &[base]).await.expect("listed");
-    assert_eq!(
-        (answer.encoding(), answer.ask_again_ms),
-        (v1::Encoding::Identity, 0),
-        "nobody waits for what nobody makes"
-    );
-    fs::write(site.folder().join("encoded").join("1.new"), b"half").expect("written");
-    let shutdown = CancellationToken::new();
-    let running = tokio::spawn(one.clone().run(shutdown.clone()));
-    let mut answer = encoding(&reader.hatch, target, &[base]).await.expect("listed");
-    while answer.encoding() != v1::Encoding::ZstdPatch {
-        tokio::time::sleep(crate::LOOK_EVERY).await;
-        answer = encoding(&reader.hatch, target, &[base]).await.expect("listed");
-    }
-    assert_eq!(answer.base_digest, base.to_string());
-    let patch = answer.encoded_digest.parse().expect("a digest");
-    let bytes = fetched(&reader.hatch, patch, answer.encoded_length).await.expect("there");
-    assert_eq!(Digest::of(&bytes), patch);
-    let answer = encoding(&reader.hatch, target, &[Digest::of(b"of nobody")]).await.expect("listed");
-    assert_eq!(answer.encoding(), v1::Encoding::Zstd, "the whole of it");
-    shutdown.cancel();
-    running.await.expect("it ends");
-    let two = site.process().await;
-    let way = encoding(&two.hatch(), target, &[base]).await.expect("listed");
-    assert_eq!(way.encoding(), v1::Encoding::ZstdPatch, "what one made the other gives");
+    assert_eq!((answer.encoding(), answer.base_digest), (v1::Encoding::ZstdPatch, base.to_string()));
+    let digest = answer.encoded_digest.parse().expect("a digest");
+    assert_eq!(fetched(&reader.hatch, digest, answer.encoded_length).await.expect("there"), patch.1);
+    let answer = encoding(&reader.hatch, target, &[]).await.expect("listed");
+    assert_eq!(answer.encoding(), v1::Encoding::Identity, "the whole of it has no shorter way");
 }
 
 #[tokio::test]

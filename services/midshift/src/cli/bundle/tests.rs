@@ -25,8 +25,11 @@ impl Place {
         let verb = Verb::Sign {
             bundle: Some(self.path(&format!("{number}.directive-keys"))),
             pending: false,
+            renew: false,
+            from: Vec::new(),
             repository: self.path("repository"),
             key: vec![self.path("keys/targets-1.pem")],
+            signature: Vec::new(),
             server: None,
             upstream,
         };
@@ -72,4 +75,21 @@ async fn nothing_is_signed_on_top_of_a_copy_that_is_behind_or_another_project() 
     place.sign(1, None).await.expect("nobody was asked");
     std::fs::write(newer.join("metadata/1.targets.json"), "{}").expect("another one");
     assert_eq!(place.sign(1, Some(newer)).await.expect_err("another").code(), 9);
+}
+
+#[test]
+fn what_robots_are_given_has_the_newest_root_and_a_key_whose_orders_they_take() {
+    let place = Place::new();
+    let (into, repository) = (place.path("trust.json"), place.path("repository"));
+    let write = |directive: &[PathBuf]| root::trust(&repository, directive, "demo", &into, &place.out);
+    assert!(write(&[]).is_err(), "robots would take orders of nobody");
+    let folder = Folder::open(&repository).expect("there");
+    folder.draft_root(None, clock::wall()).expect("a draft");
+    let key = SecretKey::read(&place.path("keys/root-1.pem")).expect("a key");
+    assert_eq!(folder.sign_root(&[&key], &[]).expect("signed"), Signed::Published(2));
+    write(&[place.path("keys/directive-1.pem")]).expect("written");
+    let trust = midshift_agent::trust::Trust::read(&into).expect("a robot reads it");
+    let directive = SecretKey::read(&place.path("keys/directive-1.pem")).expect("a key").public();
+    assert_eq!(trust.directive_keys.into_values().collect::<Vec<_>>(), [directive]);
+    assert!(String::from_utf8_lossy(&trust.root).contains("\"version\":2"), "a newer one than it began with");
 }
