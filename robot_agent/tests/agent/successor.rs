@@ -367,9 +367,9 @@ fn the_switch_record_and_the_sets_of_a_newer_version_lead_back_to_the_kept_set()
         adds_a_line(&folder.path().join(SWITCH));
         let mut sets = DiskSets::open(folder.path()).expect("opens");
         let holdings = sets.holdings().expect("tells");
-        assert_eq!((&holdings.switch, holdings.sets.into_keys().collect::<Vec<_>>()), (&switch, vec![kept.id()]));
+        assert_eq!((&holdings.switch, holdings.sets.contains_key(&kept.id())), (&switch, true));
         sets.collect(&BTreeSet::new()).expect("collects");
-        assert!(page.exists(), "the record names it, and nobody here knows all of it");
+        assert!(page.exists(), "the record names it");
         if is_committed {
             switch.undo_commit();
         } else {

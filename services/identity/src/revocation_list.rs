@@ -9,7 +9,7 @@
 use crate::{Error, files};
 use midshift_core::identity::Revocation;
 use std::collections::BTreeSet;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
@@ -87,8 +87,8 @@ fn append(path: &Path, known: Option<Marks>, revocations: &[Revocation]) -> io::
     let mut file = OpenOptions::new().append(true).create(true).mode(files::PRIVATE).open(path)?;
     file.write_all(lines.as_bytes())?;
     file.sync_all()?;
-    if let Some(folder) = path.parent().filter(|_| is_new) {
-        File::open(folder)?.sync_all()?;
+    if is_new {
+        midshift_durable::sync_folder_of(path)?;
     }
     Ok(known)
 }

@@ -36,15 +36,6 @@ async fn no_robot_is_available() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_task_that_was_accepted_a_moment_ago_is_known() {
-    let mut w = World::on(CORRIDOR).await;
-    w.robot("r1", "park-a").await;
-    w.pass(2).await;
-    w.submit("T1", "A", "B").await;
-    assert_eq!(why(&w, "T1").await, codes(Code::WaitingInQueue, ""), "the planner has not read it yet");
-}
-
-#[tokio::test(start_paused = true)]
 async fn no_robot_has_the_capability() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
