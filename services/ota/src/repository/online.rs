@@ -107,11 +107,11 @@ impl OnlineKeys {
         Ok(())
     }
 
-    fn directives(&self) -> Vec<Arc<SecretKey>> {
+    pub(super) fn directives(&self) -> Vec<Arc<SecretKey>> {
         self.directive.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    fn named_by(&self, set: &KeySet) -> Option<Arc<SecretKey>> {
+    pub(super) fn named_by(&self, set: &KeySet) -> Option<Arc<SecretKey>> {
         let here = self.directives();
         set.keys.iter().find_map(|key| here.iter().find(|own| own.public() == *key)).cloned()
     }
