@@ -1,7 +1,7 @@
 //! Holds the clock of a start against the store, and takes a person's word for the clock of a running server.
 //!
-//! The word is a file in the data folder: whoever may write there is on the machine whose clock it is. Invariant: it counts for a doubt that stands when it is read. One that
-//! comes without a doubt is taken away and accepts nothing later.
+//! The word is a file in the data folder: whoever may write there is on the machine whose clock it is. Invariant: it counts for a doubt that stands when it is read, once in
+//! each process that shares the folder. In one without a doubt it accepts nothing later.
 
 use anyhow::Context;
 use midshift_core::audit::Note;
@@ -10,9 +10,9 @@ use midshift_core::time::{Clock, Utc};
 use midshift_store::{Error, Store};
 use std::fs;
 use std::io::ErrorKind;
-use std::os::unix::fs::PermissionsExt;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 /// File of the data folder.
 const FILE: &str = "clock-accepted";
@@ -20,6 +20,8 @@ const FILE: &str = "clock-accepted";
 const ACTION: &str = "clock.accept";
 /// How often a server looks, real time.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
+/// Looks after which whoever read a word takes it away: by then each process that shares the folder has read it.
+const LOOKS: u32 = 5;
 /// Entries of the log that are looked at for the newest time of the store.
 const ENTRIES: usize = 64;
 
@@ -61,24 +63,49 @@ async fn newest_time(store: &dyn Store) -> Result<Option<Utc>, Error> {
     Ok(page.entries.iter().map(|entry| Utc(entry.at_unix_ms)).max())
 }
 
+/// The word that a process read last, by its file, and how often it saw that file since.
+#[derive(Default)]
+struct Read {
+    word: Option<(u64, SystemTime)>,
+    looks: u32,
+}
+
 /// Takes words until it is dropped.
 pub async fn run(data: &Path, clock: &dyn Clock, store: &dyn Store) {
+    let mut read = Read::default();
     loop {
-        if let Err(error) = take_word(data, clock, store).await {
+        if let Err(error) = take_word(data, clock, store, &mut read).await {
             tracing::warn!(error = format!("{error:#}"), "a word about the clock was not taken: say it again");
         }
         tokio::time::sleep(LOOK_EVERY).await;
     }
 }
 
-async fn take_word(data: &Path, clock: &dyn Clock, store: &dyn Store) -> anyhow::Result<()> {
+/// Takes away what each process has read.
+fn take_away(path: &Path, read: &mut Read) -> anyhow::Result<()> {
+    read.looks += 1;
+    if read.looks < LOOKS {
+        return Ok(());
+    }
+    match fs::remove_file(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
+        removed => removed.with_context(|| format!("removing {}", path.display())),
+    }
+}
+
+async fn take_word(data: &Path, clock: &dyn Clock, store: &dyn Store, read: &mut Read) -> anyhow::Result<()> {
     let path = data.join(FILE);
-    let by = match fs::read_to_string(&path) {
-        Ok(by) => by,
+    let reading = || format!("reading {}", path.display());
+    let word = match fs::metadata(&path) {
+        Ok(file) => Some((file.ino(), file.modified().with_context(reading)?)),
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
-        Err(error) => return Err(error).with_context(|| format!("reading {}", path.display())),
+        Err(error) => return Err(error).with_context(reading),
     };
-    fs::remove_file(&path).with_context(|| format!("removing {}", path.display()))?;
+    if read.word == word {
+        return take_away(&path, read);
+    }
+    let by = fs::read_to_string(&path).with_context(reading)?;
+    *read = Read { word, looks: 0 };
     let Some(doubt) = clock.doubt() else { return Ok(()) };
     let mut item = Item::new(Writer::Identity, &by);
     item.audit(Note::new(ACTION).with("step_ms", doubt.step_ms));
@@ -144,15 +171,35 @@ mod tests {
     async fn a_persons_word_counts_for_the_doubt_that_stands_and_leaves_a_row() {
         let dir = tempfile::tempdir().expect("a folder");
         let (wall, clock, store) = site();
+        let mut read = Read::default();
         leave_word(dir.path()).expect("said");
-        take_word(dir.path(), &*clock, &store).await.expect("taken");
+        take_word(dir.path(), &*clock, &store, &mut read).await.expect("read");
         wall.fetch_add(30 * DAY_MS, Relaxed);
-        take_word(dir.path(), &*clock, &store).await.expect("nothing lies there");
+        take_word(dir.path(), &*clock, &store, &mut read).await.expect("it was read before");
         assert!(clock.doubt().is_some(), "what was said before accepts nothing");
         assert_eq!(accepted(&store).await, 0);
         leave_word(dir.path()).expect("said");
-        take_word(dir.path(), &*clock, &store).await.expect("taken");
+        take_word(dir.path(), &*clock, &store, &mut read).await.expect("taken");
         assert_eq!((clock.doubt(), accepted(&store).await), (None, 1));
+        for _ in 0..LOOKS {
+            take_word(dir.path(), &*clock, &store, &mut read).await.expect("looked");
+        }
         assert_eq!(fs::read_dir(dir.path()).expect("a folder").count(), 0);
+    }
+
+    #[tokio::test]
+    async fn a_word_reaches_each_process_that_shares_the_folder() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let (wall, first, store) = site();
+        let said = wall.clone();
+        let second = WallClock::new(|| 0, move || Utc(said.load(Relaxed)), |_| {});
+        assert_eq!((first.doubt(), second.doubt()), (None, None));
+        wall.fetch_add(30 * DAY_MS, Relaxed);
+        assert!(first.doubt().is_some() && second.doubt().is_some());
+        leave_word(dir.path()).expect("said");
+        let (mut read, mut other) = (Read::default(), Read::default());
+        take_word(dir.path(), &*first, &store, &mut read).await.expect("taken");
+        take_word(dir.path(), &second, &store, &mut other).await.expect("taken");
+        assert_eq!((first.doubt(), second.doubt(), accepted(&store).await), (None, None, 2));
     }
 }

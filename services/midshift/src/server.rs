@@ -57,7 +57,9 @@ pub struct Server {
 
 impl Server {
     /// Builds the services; nothing runs yet. They end some time after `stop`.
-    pub async fn new(parts: Parts, stop: CancellationToken) -> anyhow::Result<Self> {
+    pub async fn new(mut parts: Parts, stop: CancellationToken) -> anyhow::Result<Self> {
+        parts.ota = parts.ota.with_rows(parts.store.clone());
+        parts.reader = parts.reader.map(|reader| reader.with_rows(parts.store.clone()));
         let board: Arc<LiveBoard<Live>> = LiveBoard::new();
         let shutdown = CancellationToken::new();
         let task = match parts.roles.has(Role::Task) {

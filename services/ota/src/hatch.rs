@@ -1,19 +1,22 @@
 //! Where bytes and documents are handed out, over gRPC to robots and over HTTP to others: from the folder of this process, or of others.
 //!
 //! Invariant: nothing is written or signed here, and only what the newest signed release lists is handed out. Shorter ways to files are listed like
-//! the files: they are made by whoever signs.
+//! the files: they are made by whoever signs. Bytes are for machines that are enrolled: a genuine certificate alone is none of a robot.
 
 use crate::content::{Content, Wanted};
 use crate::grpc::{answer, status};
 use crate::integrity::Integrity;
 use crate::repository::Documents;
 use midshift_bundle::digest::Digest;
+use midshift_core::identity::{Caller, RobotIdentity, Who};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
+use midshift_proto::access::caller;
 use midshift_proto::chunk;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::bundle_service_server::BundleService as BundleFace;
 use midshift_proto::ota::v1::chunk_service_server::ChunkService as ChunkFace;
+use midshift_store::{Store, load};
 use std::collections::BTreeSet;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -32,6 +35,8 @@ pub struct Shown {
 #[derive(Clone, Default)]
 pub struct Hatch {
     shown: Option<Arc<Shown>>,
+    /// Rows that say which machines are robots. None: nobody is held against any.
+    rows: Option<Arc<dyn Store>>,
 }
 
 impl Shown {
@@ -43,7 +48,25 @@ impl Shown {
 
 impl Hatch {
     pub(crate) fn new(content: Arc<dyn Content>, documents: Documents) -> Self {
-        Self { shown: Some(Arc::new(Shown { content, documents, integrity: Integrity::default() })) }
+        Self { shown: Some(Arc::new(Shown { content, documents, integrity: Integrity::default() })), rows: None }
+    }
+
+    /// The same, which gives bytes to those machines alone that these rows know.
+    pub(crate) fn with_rows(self, rows: Option<Arc<dyn Store>>) -> Self {
+        Self { rows, ..self }
+    }
+
+    /// Refuses a machine that shows a certificate of the site and is not enrolled as the robot that it names. Whoever shows none is the port's to judge.
+    pub(crate) async fn must_be_enrolled(&self, by: &Caller) -> Result<(), Refusal> {
+        let (Some(rows), Who::Robot(robot_id), Some(key)) = (&self.rows, by.who(), by.key()) else { return Ok(()) };
+        let found = load::<RobotIdentity>(rows.as_ref(), robot_id.as_str()).await;
+        let unavailable = |error: midshift_store::Error| {
+            Refusal::new(Kind::Unavailable, Reason::new(Code::StoreUnavailable, error.to_string()))
+        };
+        if found.map_err(unavailable)?.is_some_and(|(robot, _)| robot.has_key(key)) {
+            return Ok(());
+        }
+        Err(Refusal::new(Kind::Denied, Reason::from(Code::RobotNotEnrolled).with("robot_id", robot_id)))
     }
 
     /// Signed files that were found damaged since this was asked last.
@@ -85,7 +108,8 @@ impl Hatch {
         Ok(Wanted { digest, length })
     }
 
-    async fn encoding(&self, r: v1::GetEncodingRequest) -> Result<v1::GetEncodingResponse, Refusal> {
+    async fn encoding(&self, r: v1::GetEncodingRequest, by: &Caller) -> Result<v1::GetEncodingResponse, Refusal> {
+        self.must_be_enrolled(by).await?;
         let shown = self.shown()?;
         let mut bad = Violations::default();
         let digest = bad.take("digest", r.digest.parse::<Digest>());
@@ -110,7 +134,8 @@ impl Hatch {
         Ok(answer)
     }
 
-    async fn fetch(&self, r: v1::FetchChunksRequest) -> Result<Chunks, Refusal> {
+    async fn fetch(&self, r: v1::FetchChunksRequest, by: &Caller) -> Result<Chunks, Refusal> {
+        self.must_be_enrolled(by).await?;
         let shown = self.shown()?;
         let mut bad = Violations::default();
         let digest = bad.take("digest", r.digest.parse::<Digest>());
@@ -187,10 +212,15 @@ impl ChunkFace for Hatch {
         &self,
         r: Request<v1::GetEncodingRequest>,
     ) -> Result<Response<v1::GetEncodingResponse>, Status> {
-        answer(self.encoding(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.encoding(r.into_inner(), &by).await)
     }
 
     async fn fetch_chunks(&self, r: Request<v1::FetchChunksRequest>) -> Result<Response<Chunks>, Status> {
-        answer(self.fetch(r.into_inner()).await)
+        let by = caller(&r);
+        answer(self.fetch(r.into_inner(), &by).await)
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -9,8 +9,9 @@ use axum::extract::{Path, State};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use http::header::{ACCEPT_RANGES, CACHE_CONTROL, CONTENT_LENGTH, CONTENT_RANGE, CONTENT_TYPE, ETAG, IF_RANGE, RANGE};
-use http::{HeaderMap, StatusCode};
+use http::{Extensions, HeaderMap, StatusCode};
 use midshift_bundle::digest::Digest;
+use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::reason::{Kind, Refusal};
 use std::ops::Range;
@@ -28,6 +29,7 @@ fn refused(refusal: &Refusal) -> Response {
     let code = match refusal.kind() {
         Kind::NotFound => StatusCode::NOT_FOUND,
         Kind::Invalid => StatusCode::BAD_REQUEST,
+        Kind::Denied => StatusCode::FORBIDDEN,
         Kind::Internal => return StatusCode::INTERNAL_SERVER_ERROR.into_response(),
         _ => StatusCode::SERVICE_UNAVAILABLE,
     };
@@ -49,7 +51,16 @@ async fn metadata(State(hatch): State<Hatch>, Path(name): Path<String>) -> Respo
     }
 }
 
-async fn target(State(hatch): State<Hatch>, Path(name): Path<String>, headers: HeaderMap) -> Response {
+async fn target(
+    State(hatch): State<Hatch>,
+    Path(name): Path<String>,
+    extensions: Extensions,
+    headers: HeaderMap,
+) -> Response {
+    let by = extensions.get::<Caller>().cloned().unwrap_or_else(Caller::nobody);
+    if let Err(refusal) = hatch.must_be_enrolled(&by).await {
+        return refused(&refusal);
+    }
     match send(&hatch, &name, &headers).await {
         Ok(Some(response)) => response,
         Ok(None) => (StatusCode::NOT_FOUND, "no such file\n").into_response(),

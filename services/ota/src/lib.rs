@@ -43,7 +43,7 @@ use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::time::{Clock, Utc};
 use midshift_proto::ota::v1::bundle_service_server::BundleServiceServer;
 use midshift_proto::ota::v1::chunk_service_server::ChunkServiceServer;
-use midshift_store::StoreId;
+use midshift_store::{Store, StoreId};
 use repository::{Documents, Error, OnlineKeys, Repository};
 use std::panic::resume_unwind;
 use std::path::PathBuf;
@@ -94,6 +94,8 @@ struct Opened {
 pub struct OtaService {
     /// None: the server was given no keys, and every call says so.
     opened: Option<Arc<Opened>>,
+    /// Rows that say who is enrolled. None: nobody is held against them.
+    rows: Option<Arc<dyn Store>>,
 }
 
 impl OtaService {
@@ -135,11 +137,16 @@ impl OtaService {
         let hatch = Hatch::new(content.clone(), repository.documents().clone());
         let (named, leads) = (watch::Sender::new(None), watch::Sender::new(true));
         let opened = Opened { content, repository, collector, named, leads, clock, hatch, presence };
-        Ok(Self { opened: Some(Arc::new(opened)) })
+        Ok(Self { opened: Some(Arc::new(opened)), rows: None })
     }
     /// A service of a server without keys: it touches no disk and answers every call with what to do.
     pub fn without_keys() -> Self {
-        Self { opened: None }
+        Self { opened: None, rows: None }
+    }
+    /// The same, which gives bytes to machines alone that these rows know as robots.
+    #[must_use]
+    pub fn with_rows(self, rows: Arc<dyn Store>) -> Self {
+        Self { rows: Some(rows), ..self }
     }
     /// Releases, for people and programs.
     pub fn bundles(&self) -> BundleServiceServer<Self> {
@@ -158,7 +165,8 @@ impl OtaService {
         http1::router(self.hatch())
     }
     fn hatch(&self) -> Hatch {
-        self.opened.as_ref().map(|opened| opened.hatch.clone()).unwrap_or_default()
+        let hatch = self.opened.as_ref().map(|opened| opened.hatch.clone()).unwrap_or_default();
+        hatch.with_rows(self.rows.clone())
     }
     /// Keeps what was signed fresh, and takes away what nobody needs, until shutdown.
     pub async fn run(self, shutdown: CancellationToken) {
@@ -216,6 +224,11 @@ impl OtaReader {
         let content: Arc<dyn Content> = Arc::new(DiskContent::reading(&folder.join("content")));
         let documents = Documents::reading(&folder.join("metadata"), content.clone()).await?;
         Ok(Self { hatch: Hatch::new(content, documents.clone()), documents })
+    }
+    /// The same, which gives bytes to machines alone that these rows know as robots.
+    #[must_use]
+    pub fn with_rows(self, rows: Arc<dyn Store>) -> Self {
+        Self { hatch: self.hatch.with_rows(Some(rows)), ..self }
     }
     /// Documents, for robots: nothing else of releases is answered here.
     pub fn bundles(&self) -> BundleServiceServer<Hatch> {

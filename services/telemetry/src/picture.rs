@@ -217,7 +217,8 @@ impl Fold for Keeper {
                 self.inner.registry.fence(&robot_id, newest.unwrap_or(0));
                 self.inner.picture.touch(&robot_id);
             }
-            Table::Presence => self.inner.picture.touch(&robot_id),
+            // A label may let it into what somebody watches, or out of it.
+            Table::Presence | Table::RobotControl => self.inner.picture.touch(&robot_id),
             _ => {}
         }
         Ok(())

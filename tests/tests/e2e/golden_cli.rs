@@ -193,6 +193,20 @@ fn clear(t: &mut Transcript, places: &Value) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// What people call a robot, and which machine it is.
+fn named(t: &mut Transcript) -> anyhow::Result<()> {
+    t.note(&["robot", "label", "r1", "floor=2", "line=a", "-o", "json"])?;
+    t.note(&["robot", "label", "r1", "floor=3"])?;
+    t.note(&["robot", "label", "r1", "floor=2", "floor-"])?;
+    t.note(&["robot", "label", "r1", "floor"])?;
+    t.note(&["robot", "label", "r9", "floor=2"])?;
+    t.note(&["robot", "label", "r1", "floor-", "line-"])?;
+    t.note(&["robot", "adopt", "r1"])?;
+    t.note(&["robot", "adopt", "r1", "--key", "r1"])?;
+    t.note(&["robot", "adopt", "r1", "--key", &"0a".repeat(32)])?;
+    Ok(())
+}
+
 /// What a person sees: columns, and what to do next.
 fn for_people(t: &mut Transcript) -> anyhow::Result<()> {
     t.note(&["robot", "cordon", "r1", "--reason", "a wheel squeaks"])?;
@@ -273,6 +287,9 @@ async fn rollouts(room: &Room, t: &mut Transcript, address: SocketAddr) -> anyho
     t.note(&["robot", "pin", "r9", "--reason", "it is being measured"])?;
     t.note(&[&create[..], &["--dry-run"]].concat())?;
     t.note(&["robot", "unpin", "r2", "-o", "json"])?;
+    t.note(&["robot", "unstick", "r2", "--reason", "I freed its disk"])?;
+    t.note(&["robot", "unstick", "r9", "--reason", "I freed its disk"])?;
+    t.note(&["robot", "replace", "r2", "--accept-key"])?;
 
     // Written down.
     t.note(&create)?;
@@ -376,6 +393,7 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["robot", "get", "r9", "-o", "json"])?;
     t.note(&["robot", "cordon", "r1", "--reason", "a wheel squeaks", "-o", "json"])?;
     t.note(&["robot", "ls", "-o", "name"])?;
+    named(&mut t)?;
     let places = t.note(&["zone", "ls", "-o", "json"])?;
     clear(&mut t, &places)?;
     t.note_stream(&["robot", "watch", "r1", "-o", "json"], 1)?;

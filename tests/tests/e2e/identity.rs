@@ -35,14 +35,14 @@ const TASKS: usize = 30;
 const LIMIT: Duration = Duration::from_secs(60);
 
 /// What the command line prints as JSON.
-pub fn json(server: &Server, arguments: &[&str]) -> anyhow::Result<Value> {
-    let address = server.address.to_string();
+pub fn json(server: SocketAddr, arguments: &[&str]) -> anyhow::Result<Value> {
+    let address = server.to_string();
     let output = call(&[arguments, &["-o", "json", "--server", &address]].concat())?;
     ensure!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
     Ok(serde_json::from_slice(&output.stdout)?)
 }
 
-pub fn incidents(server: &Server) -> anyhow::Result<Vec<Value>> {
+pub fn incidents(server: SocketAddr) -> anyhow::Result<Vec<Value>> {
     let listed = json(server, &["incident", "ls", "--all"])?;
     Ok(listed["incidents"].as_array().cloned().unwrap_or_default())
 }
@@ -86,7 +86,7 @@ async fn a_copied_key_is_observed_with_an_incident_while_the_original_works_and_
     })
     .await?;
     let told = until("the incident", LIMIT, async || {
-        let told = incidents(&server)?;
+        let told = incidents(server.address)?;
         Ok((!told.is_empty()).then_some(told))
     })
     .await?;
@@ -109,7 +109,7 @@ async fn a_copied_key_is_observed_with_an_incident_while_the_original_works_and_
     let audit = std::fs::read_to_string(dir.path().join("data/stop/audit.jsonl"))?;
     let held = audit.lines().filter(|line| line.contains(Code::LineHeld.as_str())).collect::<Vec<_>>();
     ensure!(held.len() == 1 && held[0].contains("rbt-01"), "{audit}");
-    ensure!(incidents(&server)?.len() == 1, "told once: {:?}", incidents(&server)?);
+    ensure!(incidents(server.address)?.len() == 1, "told once: {:?}", incidents(server.address)?);
 
     // Whoever it was: the key is worth nothing any more, on connections that stand and on new ones.
     done(&["robot", "revoke", "rbt-01", "--server", &address.to_string()])?;
@@ -202,7 +202,7 @@ async fn a_secret_that_enrolled_one_machine_is_refused_to_the_next_and_a_new_one
     ensure!(second.ends().await? == Some(1), "the second machine was let in");
     let said = std::fs::read_to_string(other.join("agent.log"))?;
     ensure!(said.contains("was used"), "{said}");
-    ensure!(Enrolled::read(&other)?.is_none() && incidents(&server)?.is_empty(), "{said}");
+    ensure!(Enrolled::read(&other)?.is_none() && incidents(server.address)?.is_empty(), "{said}");
 
     // As one does whose certificate ran out while it was off.
     first.kill()?;
@@ -231,10 +231,10 @@ async fn a_secret_that_enrolled_one_machine_is_refused_to_the_next_and_a_new_one
 }
 
 /// The command line as the holder of this token has it.
-pub fn call_as(server: &Server, token: &str, arguments: &[&str]) -> anyhow::Result<Output> {
+pub fn call_as(server: SocketAddr, token: &str, arguments: &[&str]) -> anyhow::Result<Output> {
     let mut command = Command::new(midshift()?);
-    sign_in(&mut command, server.address);
-    command.env("MIDSHIFT_TOKEN", token).args(arguments).args(["--server", &server.address.to_string()]);
+    sign_in(&mut command, server);
+    command.env("MIDSHIFT_TOKEN", token).args(arguments).args(["--server", &server.to_string()]);
     heard(&mut command)
 }
 
@@ -244,7 +244,7 @@ async fn a_token_that_was_revoked_is_worth_nothing_at_the_stop_port_either_and_w
     let dir = folder()?;
     let server = Server::start(dir.path()).await?;
     let stops = StopServer::start(dir.path(), server.address).await?;
-    let made = json(&server, &["token", "create", "bert", "--role", "viewer"])?;
+    let made = json(server.address, &["token", "create", "bert", "--role", "viewer"])?;
     let token = made["secret"].as_str().context("a secret")?;
     let token_id = made["token"]["tokenId"].as_str().or(made["token"]["token_id"].as_str()).context("an id")?;
     let stop_port = stops.address.to_string();
@@ -288,19 +288,19 @@ async fn a_token_that_acts_outside_its_area_is_denied_and_that_stands_in_the_aud
         "--server",
         &server.address.to_string(),
     ])?;
-    let made = json(&server, &["token", "create", "bert", "--role", "viewer,dispatcher@packing"])?;
+    let made = json(server.address, &["token", "create", "bert", "--role", "viewer,dispatcher@packing"])?;
     let token = made["secret"].as_str().context("a secret")?;
     let cancel = ["task", "cancel", "T1", "--reason", "in my way", "--request-id", "c1"];
-    let output = call_as(&server, token, &cancel)?;
+    let output = call_as(server.address, token, &cancel)?;
     let said = String::from_utf8_lossy(&output.stderr);
     ensure!(output.status.code() == Some(6) && said.contains("bert may not"), "{output:?}");
-    let rows = json(&server, &["audit", "ls", "--actor", "bert"])?;
+    let rows = json(server.address, &["audit", "ls", "--actor", "bert"])?;
     let [row] = rows["rows"].as_array().map(Vec::as_slice).unwrap_or_default() else { anyhow::bail!("{rows}") };
     assert_eq!(
         (&row["action"], &row["outcome"]),
         (&Value::from("task.cancel"), &Value::from(Code::NotPermitted.as_str()))
     );
-    let task = json(&server, &["task", "get", "T1"])?;
+    let task = json(server.address, &["task", "get", "T1"])?;
     ensure!(
         task["task"]["state"] == "TASK_STATE_QUEUED" && task["task"]["etag"] == "1",
         "something became of it: {task}"

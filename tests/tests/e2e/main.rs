@@ -56,6 +56,7 @@ mod rolling;
 mod room;
 mod secrets;
 mod split;
+mod split_restored;
 mod stack;
 mod stop_alone;
 mod stopped;

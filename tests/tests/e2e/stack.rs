@@ -174,6 +174,13 @@ impl Stack {
         Ok(std::fs::read_to_string(&self.member(role, nth)?.log)?)
     }
 
+    /// The database is lost: an empty one stands in its place. No process may use it then.
+    pub fn lose_database(&self) -> anyhow::Result<()> {
+        let name = self.near.split(['/', '?']).nth(3).context("a database has a name")?;
+        tokio::task::block_in_place(|| self.postgres.emptied(name));
+        Ok(())
+    }
+
     /// The database, by the way of all but the first gateway.
     pub fn url(&self) -> &str {
         &self.url

@@ -7,12 +7,14 @@ use hyper_util::rt::TokioIo;
 use midshift::samples::{self, Made, Signer};
 use midshift_agent::dial::{self, Cut, Dial};
 use midshift_agent::trust::Trust;
+use midshift_bundle::build;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::directive::{Directive, LIFE_MS};
-use midshift_bundle::folder::Folder;
+use midshift_bundle::folder::{Folder, Signed};
 use midshift_bundle::installed;
 use midshift_bundle::keys::SecretKey;
-use midshift_bundle::repository::listed;
+use midshift_bundle::repository::{Profile, listed};
+use midshift_bundle::ways::Way;
 use midshift_core::authority::Authority;
 use midshift_core::ids::{DrainId, SetId};
 use midshift_core::reason::Code;
@@ -32,17 +34,20 @@ use midshift_proto::ota::v1::{PublishRepositoryRequest, UploadTargetRequest};
 use midshift_proto::session::{
     ClockSample, Downlink, Echo, FromRobot, Heartbeat, LaneAck, LaneBatch, PROTOCOL_VERSION, ToRobot, Welcome,
 };
-use midshift_sim::behaviour::Behaviour;
+use midshift_sim::behaviour::{Behaviour, COMPONENT};
+use midshift_sim::body::MODEL;
 use midshift_sim::faults::FaultRates;
 use midshift_sim::hall::{Hall, HallConfig};
 use midshift_sim::swarm::{DialFor, Swarm, SwarmConfig};
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use tempfile::TempDir;
 use tokio::io::DuplexStream;
 use tokio::sync::{mpsc, watch};
 use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::io::InspectReader;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::AbortOnDropHandle;
 use tonic::transport::{Channel, Endpoint, Server, Uri};
@@ -62,18 +67,23 @@ struct Pipes {
     endpoint: Endpoint,
     ends: Ends,
     network: Option<watch::Receiver<bool>>,
+    /// Bytes that came out of them.
+    came: Arc<AtomicU64>,
 }
 
 #[async_trait]
 impl Dial for Pipes {
     async fn dial(&self) -> Result<Channel, dial::Error> {
-        let (ends, network) = (self.ends.clone(), self.network.clone());
+        let (ends, network, came) = (self.ends.clone(), self.network.clone(), self.came.clone());
         let connect = tower::service_fn(move |_: Uri| {
-            let (ends, network) = (ends.clone(), network.clone());
+            let (ends, network, came) = (ends.clone(), network.clone(), came.clone());
             async move {
                 let (near, far) = tokio::io::duplex(64 * 1024);
                 ends.send(Ok(far)).await.map_err(io::Error::other)?;
-                Ok::<_, io::Error>(TokioIo::new(Cut::new(near, network)))
+                let count = move |bytes: &[u8]| {
+                    came.fetch_add(bytes.len() as u64, Ordering::Relaxed);
+                };
+                Ok::<_, io::Error>(TokioIo::new(Cut::new(InspectReader::new(near, count), network)))
             }
         });
         self.endpoint.connect_with_connector(connect).await.map_err(|e| dial::Error(e.into()))
@@ -102,7 +112,7 @@ impl LinkService for Desk {
     }
 }
 
-/// A swarm of one, its repository with all samples, and the test's side of its sessions.
+/// A swarm of one, its repository, and the test's side of its sessions.
 struct Bench {
     dir: TempDir,
     made: Made,
@@ -117,6 +127,8 @@ struct Bench {
     states: Vec<UpdateState>,
     /// What it said at its last Hello that it has installed.
     installed: Option<Installed>,
+    /// Bytes of releases and of their documents that came to the robot, as they were on the way.
+    fetched: Arc<AtomicU64>,
     _server: AbortOnDropHandle<Result<(), tonic::transport::Error>>,
     _robots: DropGuard,
 }
@@ -145,12 +157,18 @@ fn trust(made: &Made, keys: &Path, hall: &HallConfig) -> anyhow::Result<Trust> {
 }
 
 impl Bench {
+    /// With all samples.
     async fn open() -> anyhow::Result<Self> {
+        Self::of(|dir| Ok(samples::make(dir, None, Signer::Throwaway, BEGIN)?)).await
+    }
+
+    /// With what is made in a folder.
+    async fn of(make: impl FnOnce(&Path) -> anyhow::Result<Made>) -> anyhow::Result<Self> {
         let dir = tempfile::tempdir()?;
         let start = tokio::time::Instant::now();
         let clock: Arc<dyn Clock> =
             Arc::new(ScaledClock::new(move || start.elapsed().as_micros() as u64, BEGIN, 1_000));
-        let made = samples::make(&dir.path().join("samples"), None, Signer::Throwaway, BEGIN)?;
+        let made = make(&dir.path().join("samples"))?;
         let keys = made.keys.clone().context("has keys")?;
         let folder = dir.path().join("server");
         let parts =
@@ -164,21 +182,24 @@ impl Bench {
             .add_service(ota.chunks())
             .serve_with_incoming(ReceiverStream::new(incoming));
         let server = AbortOnDropHandle::new(tokio::spawn(server));
-        let pipes = |endpoint: Endpoint, network| Pipes { endpoint, ends: ends.clone(), network };
-        publish(pipes(dial::endpoint("http://server")?, None).dial().await?, &made).await?;
+        let endpoint = dial::endpoint("http://server")?;
+        let people = Pipes { endpoint, ends: ends.clone(), network: None, came: Arc::default() };
+        publish(people.dial().await?, &made).await?;
 
         let site = Arc::new(text::parse(CORRIDOR)?);
         let quiet = HallConfig { faults: FaultRates::none(), drains: false, ..HallConfig::new(site, 1, 7) };
         let hall = Arc::new(Hall::open(&quiet, &clock.now())?);
-        let to = |make: fn(&str) -> Result<Endpoint, dial::Error>| -> DialFor {
+        let fetched: Arc<AtomicU64> = Arc::default();
+        let to = |make: fn(&str) -> Result<Endpoint, dial::Error>, came: Arc<AtomicU64>| -> DialFor {
             let ends = ends.clone();
             Arc::new(move |_, network| {
-                Ok(Arc::new(Pipes { endpoint: make("http://server")?, ends: ends.clone(), network: Some(network) }))
+                let (endpoint, network) = (make("http://server")?, Some(network));
+                Ok(Arc::new(Pipes { endpoint, ends: ends.clone(), network, came: came.clone() }))
             })
         };
         let mut config = SwarmConfig::tcp(hall.clone(), clock, "http://server", 7);
-        config.dial = to(dial::endpoint);
-        config.bulk = to(dial::bulk_endpoint);
+        config.dial = to(dial::endpoint, Arc::default());
+        config.bulk = to(dial::bulk_endpoint, fetched.clone());
         config.software = Some(trust(&made, &keys, &quiet)?);
         let shutdown = CancellationToken::new();
         tokio::spawn(Swarm::new(config).run(shutdown.clone()));
@@ -194,6 +215,7 @@ impl Bench {
             newest: None,
             states: Vec::new(),
             installed: None,
+            fetched,
             _server: server,
             _robots: shutdown.drop_guard(),
         })
@@ -232,6 +254,24 @@ impl Bench {
             }
         }
         anyhow::bail!("never over: {:?}", self.newest)
+    }
+
+    /// As [`Bench::update`], to the end that it keeps it; the bytes that came for it.
+    async fn fetched_for(&mut self, version: &str) -> anyhow::Result<u64> {
+        let before = self.fetched.load(Ordering::Relaxed);
+        let (_, over) = self.update(version).await?;
+        anyhow::ensure!(over.state == UpdateState::Committed, "{over:?}");
+        Ok(self.fetched.load(Ordering::Relaxed) - before)
+    }
+
+    /// How long the shorter way is that was signed from the one release to the other, or to a robot that has none.
+    fn way(&self, from: Option<usize>, to: usize) -> anyhow::Result<u64> {
+        let targets =
+            Folder::open(&self.made.repository)?.document(&format!("{}.targets.json", self.made.targets_version));
+        let files = listed(&targets?.context("no targets")?)?;
+        let behaviour = |nth: usize| self.made.bundles[nth].1.components[0].digest;
+        let name = Way { to: behaviour(to), from: from.map(behaviour) }.target();
+        Ok(files.into_iter().find(|file| file.name == name).with_context(|| format!("no {name}"))?.length)
     }
 
     /// Hears the robot up to its next heartbeat and answers that one.
@@ -389,5 +429,67 @@ async fn a_robot_of_a_swarm_goes_back_to_what_it_kept_from_a_release_that_cannot
         assert_eq!(bench.software(), of_sample("1.5.0"), "{bad}");
         assert_eq!(bench.update("1.5.1").await?.1.state, UpdateState::Committed, "it takes the next one");
     }
+    Ok(())
+}
+
+/// Releases whose settings are long and differ in a word.
+const LONG: [(&str, u32); 2] = [("1.5.0", 900), ("1.5.1", 800)];
+
+/// Settings with this speed and comments that hardly become shorter by themselves.
+fn long_settings(speed_permille: u32) -> String {
+    let mut state = 7_u64;
+    let mut letter = |_: i32| {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        char::from(b'0' + (state >> 58) as u8)
+    };
+    let mut settings = format!("speed_permille = {speed_permille}\n");
+    for _ in 0..400 {
+        settings += "# ";
+        settings.extend((0..100).map(&mut letter));
+        settings += "\n";
+    }
+    settings
+}
+
+/// Builds and signs [`LONG`] as `bundle build` and `bundle sign` do: each with patches from those before it.
+fn long_releases(dir: &Path) -> anyhow::Result<Made> {
+    let (repository, keys) = (dir.join("repository"), dir.join("keys"));
+    std::fs::create_dir_all(dir)?;
+    let folder = Folder::create(&repository, &keys, Profile::Solo, BEGIN)?;
+    let key = SecretKey::read(&keys.join("targets-1.pem"))?;
+    let mut made = Made { bundles: Vec::new(), repository, keys: Some(keys), targets_version: 0 };
+    for (version, speed_permille) in LONG {
+        let (draft, bundle) = (dir.join(format!("draft-{version}")), dir.join(format!("walk-{version}")));
+        std::fs::create_dir(&draft)?;
+        let component = format!(
+            "[[component]]\nname = \"{COMPONENT}\"\nversion = \"{version}\"\nkind = \"config\"\nfile = \"settings\"\n\
+             hardware = [\"{MODEL}\"]\nneeds = \"restart\"\n"
+        );
+        std::fs::write(
+            draft.join(build::DRAFT_FILE),
+            format!("name = \"walk\"\nversion = \"{version}\"\n{component}"),
+        )?;
+        std::fs::write(draft.join("settings"), long_settings(speed_permille))?;
+        let manifest = build::build(&draft, &bundle, &mut |_| {})?;
+        let (_, signed) = folder.add_with_ways(&bundle, &[], &[&key], BEGIN)?;
+        let Signed::Published(targets_version) = signed else { anyhow::bail!("one key is not enough") };
+        made.targets_version = targets_version;
+        made.bundles.push((bundle, manifest));
+    }
+    Ok(made)
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_release_that_was_signed_with_a_patch_from_the_one_before_is_installed_by_the_patch() -> anyhow::Result<()> {
+    let mut bench = Bench::of(long_releases).await?;
+    let [first, second] = [bench.way(None, 0)?, bench.way(None, 1)?];
+    let patch = bench.way(Some(0), 1)?;
+    // All that came: documents and what leads them too.
+    let came = bench.fetched_for("1.5.0").await?;
+    anyhow::ensure!(came >= first, "without a former release it came as {first} bytes at least, not {came}");
+    let came = bench.fetched_for("1.5.1").await?;
+    anyhow::ensure!((patch..second).contains(&came), "{came} bytes: the patch has {patch}, the file at least {second}");
+    let slower = Behaviour { speed_permille: 800, ..Behaviour::default() };
+    assert_eq!(bench.software(), (slower, "1.5.1".to_owned()));
     Ok(())
 }

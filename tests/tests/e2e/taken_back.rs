@@ -11,31 +11,32 @@ use anyhow::{Context, ensure};
 use midshift_core::reason::Code;
 use midshift_core::site::{DEMO, Site, text};
 use serde_json::Value;
+use std::net::SocketAddr;
 use std::path::Path;
 use std::time::Duration;
 
 const LIMIT: Duration = Duration::from_secs(120);
 
 /// Waits until the server hears the robot, in charge.
-async fn until_heard(server: &Server, robot_id: &str) -> anyhow::Result<()> {
+pub async fn until_heard(server: SocketAddr, robot_id: &str) -> anyhow::Result<()> {
     until(&format!("{robot_id} in charge"), LIMIT, async || {
-        let seen = presence(server.address, robot_id).await.ok();
+        let seen = presence(server, robot_id).await.ok();
         Ok(seen.filter(|(is_observed, is_heard)| !is_observed && *is_heard).map(drop))
     })
     .await
 }
 
 /// Enrols the nth robot, and starts it.
-async fn begin(server: &Server, robots: &Robots, dir: &Path, nth: usize) -> anyhow::Result<Running> {
+pub async fn begin(server: SocketAddr, robots: &Robots, dir: &Path, nth: usize) -> anyhow::Result<Running> {
     let robot_id = format!("rbt-{:02}", nth + 1);
-    let secret = enrolment(server.address, &robot_id).await?.context("a secret")?;
+    let secret = enrolment(server, &robot_id).await?.context("a secret")?;
     let running = robots.run(nth, &dir.join(&robot_id), Some(&secret))?;
     until_heard(server, &robot_id).await?;
     Ok(running)
 }
 
 /// Waits for the incident of the third robot, adopts it, and waits until it is in charge.
-async fn adopt(server: &Server) -> anyhow::Result<()> {
+pub async fn adopt(server: SocketAddr) -> anyhow::Result<()> {
     until("the incident of a machine that is not enrolled", LIMIT, async || {
         let told = incidents(server)?;
         let of = |incident: &&Value| {
@@ -44,7 +45,7 @@ async fn adopt(server: &Server) -> anyhow::Result<()> {
         Ok(told.iter().find(of).map(drop))
     })
     .await?;
-    done(&["robot", "adopt", "rbt-03", "--server", &server.address.to_string()])?;
+    done(&["robot", "adopt", "rbt-03", "--server", &server.to_string()])?;
     until_heard(server, "rbt-03").await
 }
 
@@ -84,20 +85,22 @@ async fn played(engine: Engine, with: With) -> anyhow::Result<()> {
     let mut server = Server::start_with(dir.path(), DEMO, &flags).await?;
     let address = server.address.to_string();
     let robots = Robots::waiting(dir.path(), server.address, &site, 3);
-    let mut running =
-        vec![begin(&server, &robots, dir.path(), 0).await?, begin(&server, &robots, dir.path(), 1).await?];
-    let made = json(&server, &["token", "create", "anna", "--role", "viewer"])?;
+    let mut running = vec![
+        begin(server.address, &robots, dir.path(), 0).await?,
+        begin(server.address, &robots, dir.path(), 1).await?,
+    ];
+    let made = json(server.address, &["token", "create", "anna", "--role", "viewer"])?;
     let anna = made["secret"].as_str().context("a secret")?.to_owned();
     keep_secret("a token", secret_part(&anna)?);
     let token_id = made["token"]["tokenId"].as_str().or(made["token"]["token_id"].as_str()).context("an id")?;
     let (data, backup, list) = (server.data(), dir.path().join("backup"), dir.path().join("list"));
     let (data, backup) = (data.to_string_lossy(), backup.to_string_lossy());
     run(&[&["backup", "--data", &data, "--to", &backup][..], &flags].concat())?;
-    ensure!(call_as(&server, &anna, &["robot", "ls"])?.status.success(), "she is known");
+    ensure!(call_as(server.address, &anna, &["robot", "ls"])?.status.success(), "she is known");
     // Of these three the backup knows nothing.
     done(&["token", "revoke", token_id, "--server", &address])?;
     done(&["robot", "revoke", "rbt-02", "--server", &address])?;
-    running.push(begin(&server, &robots, dir.path(), 2).await?);
+    running.push(begin(server.address, &robots, dir.path(), 2).await?);
     std::fs::copy(server.data().join("identity/revocations.jsonl"), &list)?;
     until("the copy of the list beside the stop service", LIMIT, async || {
         let copy = std::fs::read_to_string(server.data().join("stop/revocations.jsonl")).unwrap_or_default();
@@ -109,9 +112,9 @@ async fn played(engine: Engine, with: With) -> anyhow::Result<()> {
 
     restored(&mut server, with, &[&["restore", "--from", &backup, "--data", &data][..], &flags].concat(), dir.path())
         .await?;
-    until_heard(&server, "rbt-01").await?;
-    adopt(&server).await?;
-    let refused = call_as(&server, &anna, &["robot", "ls"])?;
+    until_heard(server.address, "rbt-01").await?;
+    adopt(server.address).await?;
+    let refused = call_as(server.address, &anna, &["robot", "ls"])?;
     ensure!(refused.status.code() == Some(6), "her token was revoked: {refused:?}");
     if with == With::NewTokens {
         // Robots are as they were at the backup, as it was said.
@@ -123,12 +126,12 @@ async fn played(engine: Engine, with: With) -> anyhow::Result<()> {
         Ok((presence(server.address, "rbt-02").await? == (false, false)).then_some(()))
     })
     .await?;
-    let identities = json(&server, &["robot", "identities"])?;
+    let identities = json(server.address, &["robot", "identities"])?;
     let robots = identities["robots"].as_array().cloned().unwrap_or_default();
     let keyless: Vec<&Value> =
         robots.iter().filter(|robot| robot["keySha256"].as_str().unwrap_or_default().is_empty()).collect();
     ensure!(keyless.len() == 1 && keyless[0]["robotId"] == "rbt-02", "{robots:?}");
-    let rows = json(&server, &["audit", "ls", "--action", "backup.restore"])?;
+    let rows = json(server.address, &["audit", "ls", "--action", "backup.restore"])?;
     ensure!(rows["rows"].as_array().is_some_and(|rows| rows.len() == 1), "{rows}");
     Ok(())
 }

@@ -9,6 +9,7 @@ mod ended;
 mod errands;
 mod explain;
 mod holds;
+mod labels;
 mod leads;
 mod loads;
 mod maps;

@@ -2,6 +2,7 @@
 //!
 //! Invariant: whoever copies files writes no rows: the store belongs to the server. The backup leaves a small file in the data directory, and a server
 //! with it, now or at its next start, writes the row and then takes the file away. A row is never lost, and comes once in each life of a server at most.
+//! Of several processes that share the directory one at a time does that.
 //! The name of whoever made the backup is the one of the operating system: nobody signed in for it.
 
 use super::{Access, Settled, Summary};
@@ -12,7 +13,8 @@ use midshift_core::time::Utc;
 use midshift_store::{CommitError, Store};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
-use std::fs;
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -22,6 +24,8 @@ pub const FOLDER: &str = "backups-made";
 /// What they are called in the audit.
 const MADE: &str = "backup.make";
 const RESTORED: &str = "backup.restore";
+/// Whoever writes rows of that folder holds this in it; the system lets it go with the process, however that ends.
+const TURN: &str = "turn.lock";
 /// How often a server looks, real time.
 const LOOK_EVERY: Duration = Duration::from_secs(2);
 /// Bytes of such a file at most.
@@ -122,11 +126,28 @@ pub async fn run(data: &Path, store: &dyn Store) {
     }
 }
 
-/// Writes a row for each file that lies there and is not among those `written`, and takes the file away.
+/// The turn to write rows; none: another process has it, or there is nothing to write.
+fn turn_of(folder: &Path) -> io::Result<Option<File>> {
+    let file = OpenOptions::new().create(true).truncate(false).write(true).open(folder.join(TURN));
+    let file = match file {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        file => file?,
+    };
+    match file.try_lock() {
+        Ok(()) => Ok(Some(file)),
+        Err(TryLockError::WouldBlock) => Ok(None),
+        Err(TryLockError::Error(error)) => Err(error),
+    }
+}
+
+/// Writes a row for each file that lies there and is not among those `written`, and takes the file away; nothing while another process does.
 ///
 /// # Errors
 /// The disk or the store; what is left is done another time.
 async fn take_all(data: &Path, store: &dyn Store, written: &mut BTreeSet<PathBuf>) -> anyhow::Result<()> {
+    let Some(_turn) = turn_of(&data.join(FOLDER)).context("waiting for the turn to tell of backups")? else {
+        return Ok(());
+    };
     for path in super::files::entries(&data.join(FOLDER))? {
         if path.extension().is_none_or(|ending| ending != "json") {
             continue;
@@ -207,7 +228,8 @@ mod tests {
             ("backup.make", Some("/mnt/backup"), Some("rows stops"))
         );
         assert_eq!((with("begun_unix_ms"), row.actor.starts_with("os:")), (Some("5"), true));
-        assert_eq!(fs::read_dir(dir.path().join(FOLDER)).expect("a folder").count(), 0);
+        let left = super::super::files::entries(&dir.path().join(FOLDER)).expect("a folder");
+        assert_eq!(left, [dir.path().join(FOLDER).join(TURN)]);
         let access = Access { identity: Some(super::super::Identity::ReIssue), ..Access::default() };
         let settled = Settled { tokens: 3, keys: 0, secret: Some("mst.hush".to_owned()), is_orphaned: false };
         leave_restored(dir.path(), Path::new("/mnt/backup"), &access, &settled).expect("told");
@@ -222,5 +244,23 @@ mod tests {
         written.insert(dir.path().join(FOLDER).join("stays.json"));
         take_all(dir.path(), &store, &mut written).await.expect("taken away");
         assert_eq!(store.list(Query::all(Table::IdentityAudit)).await.expect("rows").len(), 3);
+    }
+
+    #[tokio::test]
+    async fn of_two_processes_that_share_the_folder_one_writes_the_row_of_a_backup() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let clock = Arc::new(ScaledClock::new(|| 0, Utc(1_000_000), 1000));
+        let store = MemoryStore::new(SiteId::parse("s").expect("a site"), StoreId("store-1".into()), clock);
+        let summary = Summary { site_id: "s".to_owned(), begun: Utc(5), parts: Vec::new() };
+        leave_note(dir.path(), &summary, Path::new("/mnt/backup")).expect("told");
+        let written = async || {
+            take_all(dir.path(), &store, &mut BTreeSet::new()).await.expect("it looks");
+            store.list(Query::all(Table::IdentityAudit)).await.expect("rows").len()
+        };
+        let turn = turn_of(&dir.path().join(FOLDER)).expect("a file").expect("nobody is at it");
+        assert_eq!(written().await, 0, "the other one is at it");
+        drop(turn);
+        assert_eq!(written().await, 1, "the other one was killed");
+        assert_eq!(written().await, 1);
     }
 }

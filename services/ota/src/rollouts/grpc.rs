@@ -182,6 +182,7 @@ impl RolloutService {
 
     async fn exclude(&self, r: v1::ExcludeRobotRequest, by: &Caller) -> Result<v1::ExcludeRobotResponse, Refusal> {
         let mut bad = Violations::default();
+        bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
@@ -193,6 +194,7 @@ impl RolloutService {
 
     async fn write_off(&self, r: v1::WriteOffRobotRequest, by: &Caller) -> Result<v1::WriteOffRobotResponse, Refusal> {
         let mut bad = Violations::default();
+        bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
         let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
         required_reason(&r.reason, &mut bad);
         let request_id = request_id(&r.request_id, &mut bad);

@@ -1,6 +1,7 @@
 //! The picture of robots that people and programs see.
 
 use crate::world::{Result, Robot, World, clock, serve, world};
+use midshift_core::fleet::rows::RobotControl;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::robot::{Inventory, Mode, ReportedState, Vitals};
 use midshift_core::rows::{Item, Writer};
@@ -13,6 +14,7 @@ use midshift_proto::telemetry::v1::{
 };
 use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
 use midshift_telemetry::{Bugs, Parts};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 use tonic::Streaming;
@@ -22,9 +24,11 @@ struct Watcher(Streaming<WatchRobotsResponse>);
 impl Watcher {
     async fn of(world: &World, presences: &[Presence]) -> Result<Self> {
         let presences = presences.iter().map(|p| (*p).into()).collect();
-        let filter = Some(RobotFilter { presences, ..RobotFilter::default() });
+        Self::over(world, RobotFilter { presences, ..RobotFilter::default() }).await
+    }
+    async fn over(world: &World, filter: RobotFilter) -> Result<Self> {
         let mut client = TelemetryServiceClient::new(world.channel.clone());
-        let request = WatchRobotsRequest { filter, period_ms: 50 };
+        let request = WatchRobotsRequest { filter: Some(filter), period_ms: 50 };
         Ok(Self(client.watch_robots(request).await?.into_inner()))
     }
     async fn next(&mut self) -> Result<WatchRobotsResponse> {
@@ -213,6 +217,39 @@ async fn pages_of_robots_are_full_as_long_as_more_match_and_the_last_one_says_so
     }
     let presences = vec![Presence::Online.into()];
     assert!(paged(&world, RobotFilter { presences, ..RobotFilter::default() }).await?.is_empty());
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_label_of_a_person_brings_a_robot_that_is_not_heard_into_a_list_and_a_watch_and_out_again() -> Result<()> {
+    let clock = clock();
+    let store: Arc<dyn Store> =
+        Arc::new(MemoryStore::new(SiteId::parse("s")?, StoreId(Arc::from("store-1")), clock.clone()));
+    let mut item = Item::new(Writer::Telemetry, "tests");
+    item.create(&session("r1", Inventory::default())?, "session.opened");
+    assert!(store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
+    let world = begin(&store, &clock).await?;
+    assert_eq!(Watcher::of(&world, &[]).await?.presence().await?, Presence::Offline);
+    let labels = || BTreeMap::from([("floor".to_owned(), "2".to_owned())]);
+    let filter = || RobotFilter { labels: labels(), ..RobotFilter::default() };
+    let mut watcher = Watcher::over(&world, filter()).await?;
+    assert!(watcher.next().await?.robots.is_empty(), "nobody has said that of it");
+    // By the paused clock: nothing else is going to happen.
+    let mut told = async || tokio::time::timeout(Duration::from_secs(60), watcher.presence()).await;
+
+    let mut item = Item::new(Writer::Fleet, "tests");
+    let control = RobotControl { labels: labels(), ..RobotControl::new(RobotId::parse("r1")?) };
+    item.create(&control, "robot.labeled");
+    assert!(store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
+    assert_eq!(told().await??, Presence::Offline);
+    assert_eq!(paged(&world, filter()).await?, ["r1"]);
+
+    let (control, at) = midshift_store::load::<RobotControl>(&*store, "r1").await?.ok_or("no row")?;
+    let mut item = Item::new(Writer::Fleet, "tests");
+    item.update(&RobotControl { labels: BTreeMap::new(), ..control }, at, "robot.labeled");
+    assert!(store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
+    assert_eq!(told().await??, Presence::Offline, "once more, since it is shown no more");
+    assert!(paged(&world, filter()).await?.is_empty());
     Ok(())
 }
 

@@ -4,7 +4,7 @@ use super::*;
 use crate::counted::Counted;
 use crate::old_site::{DAY_MS, OldSite, ROLLOUTS, robot_id};
 use midshift_core::reason::Code;
-use midshift_core::rollout::rows::{RolloutRobot, Step};
+use midshift_core::rollout::rows::{Lost, RolloutRobot, Step};
 use midshift_core::time::Utc;
 
 /// Robots that each roll-out reached.
@@ -113,6 +113,83 @@ async fn a_robot_that_is_tried_again_at_the_standby_long_after_the_end_is_decide
     assert_eq!((robot.again, robot.step, why), (true, Step::Skipped, Some(Code::BundleRevoked)));
     for process in [&leader, &standby] {
         assert_eq!(held(process).await, (0, 0));
+    }
+    leader.end().await;
+    standby.end().await;
+}
+
+/// Asks that the robot of this number counts for nothing in roll-out 5, or what the test makes of it.
+async fn write_off(
+    process: &Process,
+    number: u64,
+    change: impl FnOnce(&mut v1::WriteOffRobotRequest),
+) -> Result<v1::WriteOffRobotResponse, tonic::Status> {
+    let mut request = v1::WriteOffRobotRequest {
+        rollout_id: id(5),
+        robot_id: robot_id(number).to_string(),
+        reason: "it burnt".to_owned(),
+        request_id: "w-1".to_owned(),
+        ..Default::default()
+    };
+    change(&mut request);
+    Ok(Face::write_off_robot(&process.face, local(request)).await?.into_inner())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_lost_robot_is_written_off_once_for_a_request_id_whichever_process_is_asked_and_a_check_writes_nothing() {
+    let world = old_world().await;
+    let of = format!("{}/{}", id(5), robot_id(7));
+    let (robot, at) = world.row::<RolloutRobot>(&of).await.expect("a row");
+    let lost = Some(Lost { since: world.clock.now().utc, written_off: None });
+    let mut item = Item::new(Writer::Ota, "tests");
+    item.update(&RolloutRobot { lost, ..robot }, at, "robot.lost");
+    world.store.commit(vec![item]).await.remove(0).expect("applied");
+    let (leader, standby) = (world.process().await, world.process().await);
+    let kept = async || {
+        let (row, at) = world.row::<RolloutRobot>(&of).await.expect("a row");
+        (row.lost.expect("it is lost").written_off, at)
+    };
+    let (_, before) = kept().await;
+    for process in [&leader, &standby] {
+        write_off(process, 7, |r| r.validate_only = true).await.expect("nothing is against it");
+    }
+    assert_eq!(kept().await, (None, before), "it was only asked whether it may be");
+    let answer = write_off(&standby, 7, |_| {}).await.expect("written off");
+    assert_eq!((answer.done_before, answer.rollout.map(|r| r.rollout_id)), (None, Some(id(5))));
+    let (written_off, written) = kept().await;
+    assert_eq!(written_off.map(|act| act.reason).as_deref(), Some("it burnt"));
+    for process in [&leader, &standby] {
+        let again = write_off(process, 7, |_| {}).await.expect("done already");
+        assert!(again.done_before.is_some(), "{again:?}");
+        let other = write_off(process, 7, |r| r.reason = "it drowned".to_owned()).await.expect_err("the id is taken");
+        assert_eq!(other.code(), tonic::Code::AlreadyExists);
+    }
+    assert_eq!(kept().await.1, written, "written once");
+    leader.end().await;
+    standby.end().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn who_is_asked_to_write_a_robot_off_names_all_that_is_wrong_with_it() {
+    let world = old_world().await;
+    let (leader, standby) = (world.process().await, world.process().await);
+    let refused = async |process: &Process, number: u64, change: fn(&mut v1::WriteOffRobotRequest)| {
+        midshift_proto::refusal_of(&write_off(process, number, change).await.expect_err("it is refused"))
+    };
+    for process in [&leader, &standby] {
+        let wrong = refused(process, 7, |r| {
+            *r = v1::WriteOffRobotRequest { request_id: "a b".to_owned(), ..Default::default() };
+        });
+        let wrong = wrong.await;
+        let fields: Vec<&str> = wrong.violations.iter().map(|violation| violation.field.as_str()).collect();
+        assert_eq!(wrong.grpc, tonic::Code::InvalidArgument);
+        assert_eq!(fields, ["rollout_id", "robot_id", "reason", "request_id"]);
+        let unknown = refused(process, 7, |r| r.rollout_id = id(ROLLOUTS + 1)).await;
+        assert_eq!((unknown.grpc, unknown.code), (tonic::Code::NotFound, Some(Code::RolloutNotFound)));
+        let nobody = refused(process, ROBOTS + 1, |_| {}).await;
+        assert_eq!((nobody.grpc, nobody.code), (tonic::Code::NotFound, Some(Code::RobotNotFound)));
+        let heard = refused(process, 7, |_| {}).await;
+        assert_eq!((heard.grpc, heard.code), (tonic::Code::FailedPrecondition, Some(Code::RobotNotLost)));
     }
     leader.end().await;
     standby.end().await;
