@@ -5,8 +5,10 @@
 
 mod check;
 mod documents;
+mod keyless;
 
 pub use documents::Documents;
+pub use keyless::{Keyless, SetLost};
 
 use crate::blocking;
 use crate::content::{self, Content};
@@ -20,7 +22,7 @@ use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::{self as people, FileTarget, Online, TIMESTAMP_LIFE_MS, listed, sign_online};
 use midshift_bundle::ways::Way;
 use midshift_core::identity::{Actor, TokenId};
-use midshift_core::reason::{Code, Reason, Refusal};
+use midshift_core::reason::Refusal;
 use midshift_core::time::{Clock, Doubt, Utc};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
@@ -100,59 +102,6 @@ pub enum Error {
         /// What does not hold.
         text: String,
     },
-}
-
-/// Why no order to robots may be signed: they would refuse it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Keyless {
-    /// The newest set of directive keys names none that is here.
-    Ended {
-        /// The set's.
-        number: u64,
-    },
-    /// A set is listed and the disk does not give it, so nobody knows which keys have ended.
-    Unknown,
-    /// The newest set is listed, and its file is gone or damaged. It is tried again each second.
-    Lost(SetLost),
-    /// The wall of this machine is in doubt: what is signed by it would end too early or too late.
-    Clock,
-}
-
-/// The newest set of directive keys is listed, and its file is gone or damaged.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct SetLost {
-    /// The set's.
-    pub number: u64,
-}
-
-impl Keyless {
-    /// For people.
-    pub fn reason(self) -> Reason {
-        match self {
-            Self::Ended { number } => Reason::from(Code::NoDirectiveKey).with("set", number),
-            Self::Unknown => Reason::from(Code::NoDirectiveKey).with("set", "unreadable"),
-            Self::Clock => Reason::from(Code::ClockDoubted),
-            Self::Lost(SetLost { number }) => {
-                Reason::from(Code::NoDirectiveKey).with("set", number).with("file", "gone or damaged")
-            }
-        }
-    }
-
-    /// What to do about it.
-    const fn advice(self) -> &'static str {
-        match self {
-            Self::Ended { .. } => {
-                "put a key of the newest set into the folder of --ota-keys, or push a next set that names one it has"
-            }
-            Self::Unknown => {
-                "see to the disk, and to who may read its folder `content`: which keys have ended is read there"
-            }
-            Self::Lost(_) => {
-                "put the file of the newest set, N.directive-keys, back into the folder `content` under its SHA-256, from a backup or from the repository that was pushed"
-            }
-            Self::Clock => Code::ClockDoubted.next_step(),
-        }
-    }
 }
 
 /// Keys that say which release is the newest. More than one of a role may lie ready; the root says which counts.
@@ -620,8 +569,9 @@ impl Repository {
         before: Option<&Newest>,
         roots: Vec<Vec<u8>>,
         targets: Vec<u8>,
-        Act { by, at: now }: Act,
+        Act { by, at }: Act,
     ) -> Result<Publication, Error> {
+        let now = self.undoubted(at)?;
         let known = match before {
             // A root that came before is no news.
             Some(newest) => {
@@ -660,15 +610,21 @@ impl Repository {
         Ok(Publication { writes, newest })
     }
 
-    fn sign(&self, before: Option<&Newest>, root: &Kept, targets: &[u8], now: Utc) -> Result<(Online, Stamp), Error> {
+    /// Signs by the time at which it signs, not by the one at which somebody asked: the wall may have been wrong then.
+    fn sign(&self, before: Option<&Newest>, root: &Kept, targets: &[u8], asked: Utc) -> Result<(Online, Stamp), Error> {
         let (snapshot, timestamp) = before.map_or((1, 1), |b| (b.stamp.snapshot_version + 1, b.stamp.version + 1));
         let versions = (snapshot.max(self.floor), timestamp.max(self.floor));
-        if let Some(doubt) = self.doubt() {
-            return Err(Error::Clock(doubt));
-        }
-        let online = self.keys.sign(root, targets, versions, now)?;
+        let online = self.keys.sign(root, targets, versions, self.undoubted(asked)?)?;
         let stamp = stamp(&online.timestamp)?;
         Ok((online, stamp))
+    }
+
+    /// The time to sign by now; `given` where times are given by whoever asks.
+    fn undoubted(&self, given: Utc) -> Result<Utc, Error> {
+        match &self.clock {
+            Some(clock) => clock.undoubted().map(|now| now.wall).map_err(Error::Clock),
+            None => Ok(given),
+        }
     }
 
     /// Those bundles whose manifest is listed or still here: of the others nobody asks.
