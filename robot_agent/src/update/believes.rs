@@ -33,11 +33,13 @@ impl AgentCore {
     }
 
     pub(super) fn trusted(&self) -> Result<Trusted, Reason> {
-        if let Some(trusted) = &self.kept.ledger.trusted {
-            return Ok(Trusted::clone(trusted));
-        }
-        let root = self.update.config.as_ref().map(|c| c.root.as_slice()).unwrap_or_default();
-        Trusted::new(root).map_err(|e| Reason::new(Code::MetadataRefused, e.to_string()))
+        let root = self.update.config.as_ref().map(|c| c.root.as_slice());
+        let trusted = match (&self.kept.ledger.trusted, root) {
+            (Some(trusted), Some(root)) => trusted.from_root(root),
+            (Some(trusted), None) => Ok(Trusted::clone(trusted)),
+            (None, root) => Trusted::new(root.unwrap_or_default()),
+        };
+        trusted.map_err(|e| Reason::new(Code::MetadataRefused, e.to_string()))
     }
 
     /// Notes since when the time floor is what it is, by the robot's own clock.
