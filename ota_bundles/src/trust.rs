@@ -95,6 +95,16 @@ fn keeps(old: &Root, new: &Root) -> BTreeMap<Kept, bool> {
     ])
 }
 
+fn parsed(root: &str) -> Result<Root, Error> {
+    let root: Signed<Root> = serde_json::from_str(root).map_err(Error::NoRoot)?;
+    Ok(root.signed)
+}
+
+fn shares_root_key(one: &Root, other: &Root) -> bool {
+    let keys = role_keys(one, RoleType::Root);
+    role_keys(other, RoleType::Root).iter().any(|key| keys.contains(key))
+}
+
 fn known_roles<'de, D: Deserializer<'de>>(from: D) -> Result<BTreeMap<Kept, u64>, D::Error> {
     let mut named = BTreeMap::<String, u64>::deserialize(from)?;
     Ok(Kept::ALL.into_iter().filter_map(|(role, name)| Some((role, named.remove(name)?))).collect())
@@ -206,16 +216,21 @@ impl Trusted {
         if self.origin.is_none_or(|origin| Some(origin) == begun.origin) {
             return Ok(Self { origin: begun.origin, ..self.clone() });
         }
-        let read = |root: &str| serde_json::from_str::<Signed<Root>>(root).map_err(Error::NoRoot);
-        let (old, new) = (read(&self.root)?.signed, read(&begun.root)?.signed);
-        let before = role_keys(&old, RoleType::Root);
-        if new.version <= old.version && role_keys(&new, RoleType::Root).iter().any(|key| before.contains(key)) {
+        let (old, new) = (parsed(&self.root)?, parsed(&begun.root)?);
+        if new.version <= old.version && shares_root_key(&old, &new) {
             return Ok(self.clone());
         }
         let keeps = keeps(&old, &new);
         let kept = self.versions.iter().filter(|(role, _)| **role != Kept::Root && keeps[*role]);
         let versions = begun.versions.iter().chain(kept).map(|(role, version)| (*role, *version)).collect();
         Ok(Self { versions, time_floor: self.time_floor, bugs: self.bugs, ..begun })
+    }
+    /// Whether somebody who signs for one signs for the other.
+    ///
+    /// # Errors
+    /// If a root cannot be read.
+    pub fn shares_root_key(&self, other: &Self) -> Result<bool, Error> {
+        Ok(shares_root_key(&parsed(&self.root)?, &parsed(&other.root)?))
     }
     /// Of which these naive rules count.
     #[must_use]
@@ -324,10 +339,10 @@ impl Trusted {
         heard: &BTreeMap<String, Vec<u8>>,
         clock: Reading,
     ) -> Result<Refreshed, Error> {
-        let old: Signed<Root> = serde_json::from_str(&self.root).map_err(Error::NoRoot)?;
+        let old = parsed(&self.root)?;
         let (root, timestamp) = (repository.root(), repository.timestamp());
         let (snapshot, targets) = (repository.snapshot(), repository.targets());
-        let keeps = keeps(&old.signed, &root.signed);
+        let keeps = keeps(&old, &root.signed);
         let offered = [
             (Kept::Root, "root", root.signed.version.get(), root.signed.expires),
             (Kept::Timestamp, "timestamp", timestamp.signed.version.get(), timestamp.signed.expires),

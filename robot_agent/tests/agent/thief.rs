@@ -120,11 +120,12 @@ fn a_thief_of_the_root_key_has_every_robot_until_a_person_puts_a_new_trust_file_
     let releases = Releases::new();
     let good = releases.release("1.1.0");
     let mut rig = robot(&releases, &good);
+    releases.list_keys(1, &[9], DIRECTIVE);
 
     // He hands everything over to keys of his own. No robot can tell him from Ann, Ben and Cleo.
     releases.hand_over((21, 22), (23, 24));
     let evil = releases.release("6.6.6");
-    assert_eq!(ordered(&mut rig, &releases, DIRECTIVE, &evil, 2), None, "a thief can replace everybody");
+    assert_eq!(ordered(&mut rig, &releases, 9, &evil, 2), None, "a thief can replace everybody");
     assert_eq!(state(&rig), Some(UpdateState::Staged));
 
     // A new project: no robot goes over to it by itself.
@@ -136,10 +137,13 @@ fn a_thief_of_the_root_key_has_every_robot_until_a_person_puts_a_new_trust_file_
     // The new trust file is put there, and the agent is started again.
     let mut rig = rig.restart();
     rig.connect();
-    assert_eq!(ordered(&mut rig, &releases, DIRECTIVE, &anew, 4), Some(Code::BadSignature), "the key of before");
+    assert_eq!(ordered(&mut rig, &releases, 9, &anew, 4), Some(Code::BadSignature), "the key of before");
     assert_eq!(ordered(&mut rig, &releases, NEW_DIRECTIVE, &evil, 5), Some(Code::DirectiveRefused), "nobody lists it");
     assert_eq!(ordered(&mut rig, &releases, NEW_DIRECTIVE, &anew, 6), None);
     assert_eq!(state(&rig), Some(UpdateState::Staged));
+    releases.list_keys(1, &[10], NEW_DIRECTIVE);
+    let next = releases.release("2.1.0");
+    assert_eq!(ordered(&mut rig, &releases, 10, &next, 7), None, "its sets of keys begin with 1 again");
 
     // Started again with that file it stays with it, and the thief's documents are refused.
     let thiefs = Releases::new();
@@ -147,5 +151,5 @@ fn a_thief_of_the_root_key_has_every_robot_until_a_person_puts_a_new_trust_file_
     releases.replay(&thiefs.documents());
     let mut rig = rig.restart();
     rig.connect();
-    assert_eq!(ordered(&mut rig, &releases, NEW_DIRECTIVE, &evil, 7), Some(Code::MetadataRefused));
+    assert_eq!(ordered(&mut rig, &releases, 10, &evil, 8), Some(Code::MetadataRefused));
 }
