@@ -137,6 +137,13 @@ pub trait Clock: Send + Sync + 'static {
     fn doubt(&self) -> Option<Doubt> {
         None
     }
+    /// All clocks at a moment at which the wall is not in doubt, by one reading: what is signed has this time.
+    ///
+    /// # Errors
+    /// Why nothing may be signed now.
+    fn undoubted(&self) -> Result<Now, Doubt> {
+        self.doubt().map_or_else(|| Ok(self.now()), Err)
+    }
     /// Holds the wall of a start against the newest time that was written down before it.
     fn check_start(&self, _newest: Utc) {}
     /// A person says that the wall is right.

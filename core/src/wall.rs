@@ -190,16 +190,10 @@ where
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
-}
 
-impl<M, W, T> Clock for WallClock<M, W, T>
-where
-    M: Fn() -> u64 + Send + Sync + 'static,
-    W: Fn() -> Utc + Send + Sync + 'static,
-    T: Fn(&Jump) + Send + Sync + 'static,
-{
-    fn now(&self) -> Now {
-        let (now, jump) = {
+    /// Reads both clocks, and gives what `of` makes of that before anybody reads them again.
+    fn reading<R>(&self, of: impl FnOnce(Now, &mut Steps) -> R) -> R {
+        let (made, jump) = {
             let mut state = self.state();
             let mono_us = (self.monotonic_us)().max(state.mono_us);
             let wall = (self.wall)();
@@ -209,12 +203,24 @@ where
             }
             state.mono_us = mono_us;
             let ms = mono_us / 1000;
-            (Now { site: SiteTime(ms), link: LinkTime(ms), utc: wall, wall, jump: state.judge.large }, jump)
+            let now = Now { site: SiteTime(ms), link: LinkTime(ms), utc: wall, wall, jump: state.judge.large };
+            (of(now, &mut state.steps), jump)
         };
         if let Some(jump) = jump {
             (self.told)(&jump);
         }
-        now
+        made
+    }
+}
+
+impl<M, W, T> Clock for WallClock<M, W, T>
+where
+    M: Fn() -> u64 + Send + Sync + 'static,
+    W: Fn() -> Utc + Send + Sync + 'static,
+    T: Fn(&Jump) + Send + Sync + 'static,
+{
+    fn now(&self) -> Now {
+        self.reading(|now, _| now)
     }
 
     fn rate_permille(&self) -> u32 {
@@ -227,8 +233,11 @@ where
 
     fn doubt(&self) -> Option<Doubt> {
         // A step that nobody has read yet counts too.
-        self.now();
-        self.state().steps.doubt(&self.synced)
+        self.undoubted().err()
+    }
+
+    fn undoubted(&self) -> Result<Now, Doubt> {
+        self.reading(|now, steps| steps.doubt(&self.synced).map_or(Ok(now), Err))
     }
 
     fn check_start(&self, newest: Utc) {

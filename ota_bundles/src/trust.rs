@@ -7,7 +7,7 @@
 
 use crate::bugs::Bugs;
 use crate::digest::Digest;
-use crate::repository::{ISSUED_AT, role_keys};
+use crate::repository::{ISSUED_AT, canonical, role_keys};
 use async_trait::async_trait;
 use midshift_core::time::Utc;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -46,6 +46,9 @@ pub trait Source: std::fmt::Debug + Send + Sync {
 pub struct Trusted {
     /// The newest root, as it was signed.
     root: String,
+    /// The root that the robot came with, by what was signed of it; none: a version wrote this that did not note it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    origin: Option<Digest>,
     timestamp: Option<String>,
     snapshot: Option<String>,
     targets: Option<String>,
@@ -79,6 +82,27 @@ impl Kept {
         (Self::Snapshot, "snapshot"),
         (Self::Targets, "targets"),
     ];
+}
+
+/// Whether versions of a role go on from one root to another: if its keys do.
+fn keeps(old: &Root, new: &Root) -> BTreeMap<Kept, bool> {
+    let same = |role| role_keys(old, role) == role_keys(new, role);
+    BTreeMap::from([
+        (Kept::Root, true),
+        (Kept::Timestamp, same(RoleType::Timestamp)),
+        (Kept::Snapshot, same(RoleType::Snapshot) && same(RoleType::Timestamp)),
+        (Kept::Targets, same(RoleType::Targets)),
+    ])
+}
+
+fn parsed(root: &str) -> Result<Root, Error> {
+    let root: Signed<Root> = serde_json::from_str(root).map_err(Error::NoRoot)?;
+    Ok(root.signed)
+}
+
+fn shares_root_key(one: &Root, other: &Root) -> bool {
+    let keys = role_keys(one, RoleType::Root);
+    role_keys(other, RoleType::Root).iter().any(|key| keys.contains(key))
 }
 
 fn known_roles<'de, D: Deserializer<'de>>(from: D) -> Result<BTreeMap<Kept, u64>, D::Error> {
@@ -172,6 +196,7 @@ impl Trusted {
         let parsed: Signed<Root> = serde_json::from_slice(root).map_err(Error::NoRoot)?;
         Ok(Self {
             root: String::from_utf8_lossy(root).into_owned(),
+            origin: Some(Digest::of(&canonical(&parsed.signed))),
             timestamp: None,
             snapshot: None,
             targets: None,
@@ -180,6 +205,32 @@ impl Trusted {
             own_time: Utc(0),
             bugs: Bugs::default(),
         })
+    }
+    /// What is believed with `root` in the trust file. It is the root that the robot came with, nobody noted which that was, or it is an older one of the
+    /// same people: what was believed. A person has put another one there: that one alone, with the versions of those roles whose keys it has not changed.
+    ///
+    /// # Errors
+    /// If it is none.
+    pub fn from_root(&self, root: &[u8]) -> Result<Self, Error> {
+        let begun = Self::new(root)?;
+        if self.origin.is_none_or(|origin| Some(origin) == begun.origin) {
+            return Ok(Self { origin: begun.origin, ..self.clone() });
+        }
+        let (old, new) = (parsed(&self.root)?, parsed(&begun.root)?);
+        if new.version <= old.version && shares_root_key(&old, &new) {
+            return Ok(self.clone());
+        }
+        let keeps = keeps(&old, &new);
+        let kept = self.versions.iter().filter(|(role, _)| **role != Kept::Root && keeps[*role]);
+        let versions = begun.versions.iter().chain(kept).map(|(role, version)| (*role, *version)).collect();
+        Ok(Self { versions, time_floor: self.time_floor, bugs: self.bugs, ..begun })
+    }
+    /// Whether somebody who signs for one signs for the other.
+    ///
+    /// # Errors
+    /// If a root cannot be read.
+    pub fn shares_root_key(&self, other: &Self) -> Result<bool, Error> {
+        Ok(shares_root_key(&parsed(&self.root)?, &parsed(&other.root)?))
     }
     /// Of which these naive rules count.
     #[must_use]
@@ -288,16 +339,10 @@ impl Trusted {
         heard: &BTreeMap<String, Vec<u8>>,
         clock: Reading,
     ) -> Result<Refreshed, Error> {
-        let old: Signed<Root> = serde_json::from_str(&self.root).map_err(Error::NoRoot)?;
+        let old = parsed(&self.root)?;
         let (root, timestamp) = (repository.root(), repository.timestamp());
         let (snapshot, targets) = (repository.snapshot(), repository.targets());
-        let same = |role| role_keys(&old.signed, role) == role_keys(&root.signed, role);
-        let keeps = BTreeMap::from([
-            (Kept::Root, true),
-            (Kept::Timestamp, same(RoleType::Timestamp)),
-            (Kept::Snapshot, same(RoleType::Snapshot) && same(RoleType::Timestamp)),
-            (Kept::Targets, same(RoleType::Targets)),
-        ]);
+        let keeps = keeps(&old, &root.signed);
         let offered = [
             (Kept::Root, "root", root.signed.version.get(), root.signed.expires),
             (Kept::Timestamp, "timestamp", timestamp.signed.version.get(), timestamp.signed.expires),
@@ -321,6 +366,7 @@ impl Trusted {
             versions.insert(kept, version);
         }
         let trusted = Self {
+            origin: self.origin,
             root: text(format!("{}.root.json", root.signed.version)).unwrap_or_else(|| self.root.clone()),
             timestamp: stamp,
             snapshot: text(format!("{}.snapshot.json", snapshot.signed.version)),

@@ -155,6 +155,17 @@ fn a_wall_that_stepped_more_than_five_minutes_is_in_doubt_until_it_is_set_back()
 }
 
 #[test]
+fn a_time_to_sign_by_and_that_nobody_doubts_it_come_of_one_reading() {
+    let machine = Machine::new();
+    let doubt = Doubt { step_ms: HOUR, at: Utc(BEGIN + HOUR) };
+    machine.ahead_ms.fetch_add(HOUR, Relaxed);
+    assert_eq!(machine.clock.undoubted(), Err(doubt), "though nobody has read the step before");
+    assert_eq!(machine.told(), [HOUR]);
+    machine.ahead_ms.fetch_sub(HOUR, Relaxed);
+    assert_eq!(machine.clock.undoubted().map(|now| now.wall), Ok(Utc(BEGIN)));
+}
+
+#[test]
 fn a_doubt_is_over_once_the_network_sets_the_wall_or_a_person_accepts_it() {
     let machine = Machine::new();
     machine.synced_ms.store(BEGIN - 1_000, Relaxed);

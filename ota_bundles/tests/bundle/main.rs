@@ -1,6 +1,7 @@
 //! Bundles as release people make them and as attackers would like them.
 
 mod building;
+mod by_hand;
 mod directives;
 mod fresh;
 mod key_sets;

@@ -10,7 +10,7 @@ use midshift_bundle::bugs::Bugs;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::directive::{Directive, Expected, Rejection};
 use midshift_bundle::key_set::Current;
-use midshift_bundle::trust::{Reading, Refreshed, Trusted};
+use midshift_bundle::trust::{self, Reading, Refreshed, Trusted};
 use midshift_core::reason::{Code, Reason};
 use midshift_core::time::{Now, Utc};
 use midshift_core::update::{DesiredUpdate, UpdateState};
@@ -32,12 +32,22 @@ impl AgentCore {
         Reading { utc: now.wall, is_synced }
     }
 
-    pub(super) fn trusted(&self) -> Result<Trusted, Reason> {
-        if let Some(trusted) = &self.kept.ledger.trusted {
-            return Ok(Trusted::clone(trusted));
+    /// What it believes. A person may have put another root into its trust file since; of other people also the sets of directive keys count anew.
+    pub(super) fn trusted(&mut self) -> Result<Trusted, Reason> {
+        let unreadable = |e: trust::Error| Reason::new(Code::MetadataRefused, e.to_string());
+        let root = self.update.config.as_ref().map(|c| c.root.clone());
+        let Some(before) = self.kept.ledger.trusted.clone() else {
+            return Trusted::new(&root.unwrap_or_default()).map_err(unreadable);
+        };
+        let Some(root) = root else { return Ok(Trusted::clone(&before)) };
+        let trusted = before.from_root(&root).map_err(unreadable)?;
+        if trusted != *before {
+            if !trusted.shares_root_key(&before).map_err(unreadable)? {
+                self.put_software(SoftwareRow { keys: None, ..self.kept.ledger.software.clone() });
+            }
+            self.write(Op::Trusted(Arc::new(trusted.clone())), true);
         }
-        let root = self.update.config.as_ref().map(|c| c.root.as_slice()).unwrap_or_default();
-        Trusted::new(root).map_err(|e| Reason::new(Code::MetadataRefused, e.to_string()))
+        Ok(trusted)
     }
 
     /// Notes since when the time floor is what it is, by the robot's own clock.

@@ -293,8 +293,8 @@ impl AgentCore {
         if self.is_observed() || self.names(&desired) {
             return false;
         }
-        let software = self.kept.ledger.software.clone();
-        let stuck = software.update.clone().filter(|update| update.state == UpdateState::Stuck);
+        let update = self.kept.ledger.software.update.clone();
+        let stuck = update.filter(|update| update.state == UpdateState::Stuck);
         let is_back = stuck.as_ref().and_then(Update::set_name).is_some_and(|set| set != holdings.switch.running());
         if holdings.switch.kept().is_none() && !is_back {
             self.refuse_way_back();
@@ -307,6 +307,7 @@ impl AgentCore {
                 return false;
             }
         };
+        let software = self.kept.ledger.software.clone();
         let opened = self.opened(&desired, software.directive, trusted.now(self.reading(now)));
         if opened == Err(Rejection::NotSigned) && self.update.keys_asked.as_ref() != Some(&desired.directive) {
             // The server may sign with a key that came since.

@@ -31,6 +31,7 @@ mod stops_beside;
 #[path = "../../../tests/src/strace.rs"]
 mod strace;
 mod successor;
+mod thief;
 mod told_time;
 mod trusts;
 mod twins;

@@ -35,6 +35,8 @@ struct Shelf {
     targets: Vec<u8>,
     version: u64,
     roots: u64,
+    /// Seeds of the keys of root and targets.
+    people: (u8, u8),
     /// Seeds of the keys of snapshot and timestamp.
     online: (u8, u8),
     /// Milliseconds after [`SIGNED`] at which the server signs now.
@@ -71,20 +73,37 @@ pub fn component(name: &str, version: &str, kind: ComponentKind, content: &[u8])
 impl Releases {
     pub fn new() -> Self {
         let releases = Self(Arc::default());
-        releases.rotate((3, 4));
-        releases.sign(&[]);
+        releases.begin((1, 2), (3, 4));
         releases
+    }
+    /// A new project of these people: nothing of another one is here any more.
+    pub fn begin(&self, people: (u8, u8), online: (u8, u8)) {
+        *self.shelf() = Shelf { people, ..Shelf::default() };
+        self.rotate(online);
+        self.sign(&[]);
+    }
+    /// Whoever has the root key hands everything over to other keys.
+    pub fn hand_over(&self, people: (u8, u8), online: (u8, u8)) {
+        let before = std::mem::replace(&mut self.shelf().people, people);
+        self.next_root(before.0, online);
+        self.sign(&[]);
     }
     /// The next root, with these seeds of keys for snapshot and timestamp. What was signed with others holds no more.
     pub fn rotate(&self, online: (u8, u8)) {
+        let by = self.shelf().people.0;
+        self.next_root(by, online);
+    }
+    /// The next root, signed by the key of seed `by` and its own.
+    fn next_root(&self, by: u8, online: (u8, u8)) {
         let mut shelf = self.shelf();
         (shelf.online, shelf.roots) = (online, shelf.roots + 1);
-        let version = shelf.roots;
+        let (version, people) = (shelf.roots, shelf.people);
         let one = |seed: u8| Signers { keys: vec![key(seed).public()], threshold: 1 };
         let expires = SIGNED.plus_ms(PEOPLE_LIFE_MS);
         let (snapshot, timestamp) = (one(online.0), one(online.1));
-        let draft = RootDraft { version, expires, root: one(1), targets: one(2), snapshot, timestamp };
-        let root = sign_root(&draft, &[&key(1)]).expect("a root");
+        let (root, targets) = (one(people.0), one(people.1));
+        let draft = RootDraft { version, expires, root, targets, snapshot, timestamp };
+        let root = sign_root(&draft, &[&key(by), &key(people.0)]).expect("a root");
         shelf.documents.insert(format!("{version}.root.json"), root);
     }
     /// A thief of the keys of snapshot and timestamp signs what is released with a version of his own.
@@ -95,6 +114,16 @@ impl Releases {
         let (snapshot, timestamp) = (key(shelf.online.0), key(shelf.online.1));
         let now = SIGNED.plus_ms(shelf.later_ms);
         let online = sign_online(&shelf.targets, version, version, now, &snapshot, &timestamp).expect("online");
+        shelf.documents.insert(format!("{version}.snapshot.json"), online.snapshot);
+        shelf.documents.insert("timestamp.json".to_owned(), online.timestamp);
+    }
+    /// A thief of the keys `online` of snapshot and timestamp signs, with a version of his own, that this is the newest targets document.
+    pub fn present(&self, online: (u8, u8), (number, targets): (u64, &[u8]), version: u64) {
+        let mut shelf = self.shelf();
+        let (snapshot, timestamp) = (key(online.0), key(online.1));
+        let now = SIGNED.plus_ms(shelf.later_ms);
+        let online = sign_online(targets, version, version, now, &snapshot, &timestamp).expect("online");
+        shelf.documents.insert(format!("{number}.targets.json"), targets.to_vec());
         shelf.documents.insert(format!("{version}.snapshot.json"), online.snapshot);
         shelf.documents.insert("timestamp.json".to_owned(), online.timestamp);
     }
@@ -121,7 +150,8 @@ impl Releases {
         let mut shelf = self.shelf();
         let previous = Some(shelf.targets.clone()).filter(|t| !t.is_empty());
         let expires = SIGNED.plus_ms(PEOPLE_LIFE_MS);
-        shelf.targets = sign_targets(previous.as_deref(), add, &[], expires, &[&key(2)]).expect("targets");
+        let by = key(shelf.people.1);
+        shelf.targets = sign_targets(previous.as_deref(), add, &[], expires, &[&by]).expect("targets");
         shelf.version += 1;
         let version = shelf.version;
         let targets = shelf.targets.clone();

@@ -47,11 +47,11 @@ impl IdentityService {
         self.0.authority.as_ref().ok_or_else(|| Refusal::new(Kind::Precondition, elsewhere()))
     }
 
-    /// The authority, if it may sign by the wall of this machine: what it signs has its beginning and its end by it.
-    fn signing(&self) -> Result<&Authority, Refusal> {
-        match self.0.clock.doubt() {
-            Some(_) => Err(Refusal::new(Kind::Unavailable, Code::ClockDoubted)),
-            None => self.authority(),
+    /// The authority and the time to sign by, if that of this machine is not in doubt: what it signs has its beginning and its end by it.
+    fn signing(&self) -> Result<(&Authority, Utc), Refusal> {
+        match self.0.clock.undoubted() {
+            Err(_) => Err(Refusal::new(Kind::Unavailable, Code::ClockDoubted)),
+            Ok(now) => Ok((self.authority()?, now.wall)),
         }
     }
 
@@ -172,7 +172,7 @@ impl IdentityService {
         let (Some(robot_id), Some(secret)) = (robot_id, secret) else {
             return Err(Refusal::field("secret", "is required"));
         };
-        let (authority, asked, now) = (self.signing()?, asked(&r.request_pem)?, self.now());
+        let ((authority, now), asked) = (self.signing()?, asked(&r.request_pem)?);
         let (key, digest) = (asked.key, tokens::digest(&secret));
         let expires = Utc(now.0.saturating_add_unsigned(limits::ROBOT_CERTIFICATE_VALID.as_ms()));
         // One at a time: whether a key is another robot's is decided over all of them.
@@ -219,7 +219,7 @@ impl IdentityService {
     ) -> Result<v1::RenewCertificateResponse, Refusal> {
         let robot_id = robot_of(&r.robot_id)?;
         caller.is_robot(&robot_id)?;
-        let (authority, asked, now) = (self.signing()?, asked(&r.request_pem)?, self.now());
+        let ((authority, now), asked) = (self.signing()?, asked(&r.request_pem)?);
         let key = asked.key;
         let expires = Utc(now.0.saturating_add_unsigned(limits::ROBOT_CERTIFICATE_VALID.as_ms()));
         self.0

@@ -220,13 +220,12 @@ impl IdentityService {
 
     async fn keep_up(&self) -> Result<(), Error> {
         let inner = &*self.0;
-        let now = inner.clock.now().wall;
         inner.register.refresh().await.map_err(Error::Store)?;
         // A certificate that begins and ends by a wrong wall is none once the wall is right.
-        if inner.clock.doubt().is_none() {
-            inner.own.ask(&inner.register, now).await?;
+        if let Ok(now) = inner.clock.undoubted() {
+            inner.own.ask(&inner.register, now.wall).await?;
             if let Some(authority) = &inner.authority {
-                answer(authority, &inner.register, now).await?;
+                answer(authority, &inner.register, now.wall).await?;
             }
         }
         if let Some(proof) = inner.own.proof(&inner.register).await? {

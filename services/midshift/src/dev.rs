@@ -12,7 +12,7 @@ use crate::stop::{self, Beside};
 use crate::tally::{self, SharedTasks, Tasks};
 use crate::throwaway::Throwaway;
 use crate::under_way::{self, UnderWay};
-use crate::{changed_map, clock, door, resuming, stop_follower};
+use crate::{changed_map, clock, clock_doubt, door, resuming, stop_follower};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_agent::trust::Trust;
@@ -489,6 +489,14 @@ impl Run {
         }
     }
 
+    /// Takes a person's word for the clock, where there is a folder to leave it in. The clock of the start is not held against the store: what is signed
+    /// here, and who believes it, is made anew by the same clock.
+    fn accept_clock(&self) -> Option<AbortOnDropHandle<()>> {
+        let (data, clock, store) = (self.args.data.clone()?, self.clock.clone(), self.store.clone());
+        let words = async move { clock_doubt::run(&data, &*clock, &*store).await };
+        Some(AbortOnDropHandle::new(tokio::spawn(words)))
+    }
+
     async fn together(
         self,
         server: Server,
@@ -515,6 +523,7 @@ impl Run {
             working: tokio::spawn(self.work(background, channel.clone(), work_stop.clone(), stand)),
         };
         let _resuming = AbortOnDropHandle::new(tokio::spawn(resuming::rounds(board.clone(), channel.clone())));
+        let _accepting = self.accept_clock();
         let progress = report::watch_progress(board, self.clock.clone(), no_progress_ms.clone());
         let _progress = AbortOnDropHandle::new(tokio::spawn(progress));
         let launched = self.stage.as_ref().map(|(stage, _)| stage.launch()).transpose()?;

@@ -5,10 +5,12 @@
 
 mod check;
 mod documents;
+mod keyless;
 mod online;
 
 pub use documents::Documents;
-pub use online::{Keyless, OnlineKeys, SetLost};
+pub use keyless::{Keyless, SetLost};
+pub use online::OnlineKeys;
 
 use crate::blocking;
 use crate::content::{self, Content};
@@ -486,8 +488,9 @@ impl Repository {
         before: Option<&Newest>,
         roots: Vec<Vec<u8>>,
         targets: Vec<u8>,
-        Act { by, at: now }: Act,
+        Act { by, at }: Act,
     ) -> Result<Publication, Error> {
+        let now = self.undoubted(at)?;
         let known = match before {
             // A root that came before is no news.
             Some(newest) => {
@@ -526,15 +529,21 @@ impl Repository {
         Ok(Publication { writes, newest })
     }
 
-    fn sign(&self, before: Option<&Newest>, root: &Kept, targets: &[u8], now: Utc) -> Result<(Online, Stamp), Error> {
+    /// Signs by the time at which it signs, not by the one at which somebody asked: the wall may have been wrong then.
+    fn sign(&self, before: Option<&Newest>, root: &Kept, targets: &[u8], asked: Utc) -> Result<(Online, Stamp), Error> {
         let (snapshot, timestamp) = before.map_or((1, 1), |b| (b.stamp.snapshot_version + 1, b.stamp.version + 1));
         let versions = (snapshot.max(self.floor), timestamp.max(self.floor));
-        if let Some(doubt) = self.doubt() {
-            return Err(Error::Clock(doubt));
-        }
-        let online = self.keys.sign(root, targets, versions, now)?;
+        let online = self.keys.sign(root, targets, versions, self.undoubted(asked)?)?;
         let stamp = stamp(&online.timestamp)?;
         Ok((online, stamp))
+    }
+
+    /// The time to sign by now; `given` where times are given by whoever asks.
+    fn undoubted(&self, given: Utc) -> Result<Utc, Error> {
+        match &self.clock {
+            Some(clock) => clock.undoubted().map(|now| now.wall).map_err(Error::Clock),
+            None => Ok(given),
+        }
     }
 
     /// Those bundles whose manifest is listed or still here: of the others nobody asks.

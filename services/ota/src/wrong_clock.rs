@@ -62,6 +62,12 @@ impl Site {
     }
     /// A release beside the first.
     async fn publish(&self, first: &[u8], version: &str, expected: u64) -> Result<Vec<u8>, Error> {
+        let document = self.bring(first, version).await?;
+        let act = Act::of_release(self.opened().now());
+        self.opened().repository.publish(Vec::new(), document.clone(), expected, act).await.map(|_| document)
+    }
+    /// Brings the files of a release beside the first, and gives the document that lists them.
+    async fn bring(&self, first: &[u8], version: &str) -> Result<Vec<u8>, Error> {
         let (opened, more) = (self.opened(), files("walk", version));
         for (_, content) in &more {
             let digest = midshift_bundle::digest::Digest::of(content);
@@ -71,9 +77,7 @@ impl Site {
                 opened.content.settle(file).await?;
             }
         }
-        let document = targets(Some(first), &more, SEEDS.targets);
-        let act = Act::of_release(opened.now());
-        opened.repository.publish(Vec::new(), document.clone(), expected, act).await.map(|_| document)
+        Ok(targets(Some(first), &more, SEEDS.targets))
     }
 }
 
@@ -131,6 +135,25 @@ async fn a_wall_that_was_thirty_days_ahead_for_a_minute_stops_no_update_afterwar
         let clock = set(later.plus_ms(FRESHEN_AFTER_MS));
         site.shown_to(robot, clock).await.expect("it takes software half a day later");
     }
+}
+
+#[tokio::test]
+async fn what_began_while_the_wall_was_wrong_is_signed_by_the_time_at_which_it_is_signed() {
+    let site = Site::new().await;
+    let first = files("walk", "1.0.0");
+    release(&site.service, &first).await;
+    let document = site.bring(&targets(None, &first, SEEDS.targets), "1.1.0").await.expect("room");
+    let repository = &site.opened().repository;
+    site.set(MONTH_MS).await;
+    let asked = site.opened().now();
+    assert_eq!(asked, Utc(START.0 + MONTH_MS));
+    site.set(-MONTH_MS).await;
+    let newest = repository.publish(Vec::new(), document, 1, Act::of_release(asked)).await.expect("signed");
+    assert_eq!((newest.stamp.version, newest.stamp.issued), (2, START));
+    assert!(newest.releases.iter().all(|release| release.seen == START), "{:?}", newest.releases);
+    repository.freshen(asked).await.expect("signed");
+    let newest = repository.newest().expect("published");
+    assert_eq!((newest.stamp.version, newest.stamp.issued), (3, START), "it was due by that wall");
 }
 
 #[tokio::test]

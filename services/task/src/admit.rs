@@ -4,12 +4,12 @@
 //! answered with its task for as long as its key is kept, even if its rules would no longer hold.
 
 use crate::TaskService;
-use crate::rows::{TaskRows, are_seen, read, unavailable};
+use crate::rows::{TaskRows, are_seen, read, unavailable, unknown_robot};
 use midshift_core::audit::Note;
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{RequestId, TaskId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violation};
-use midshift_core::rows::{Item, Key, Table, Writer};
+use midshift_core::rows::{Item, Table, Writer};
 use midshift_core::task::state::RequestKey;
 use midshift_core::task::{TaskIntake, TaskSpec, TaskState};
 use midshift_core::time::Utc;
@@ -257,11 +257,9 @@ impl TaskService {
 
     /// What a caller should know of a task that is admitted all the same: that it names a robot that nobody knows.
     pub async fn notes(&self, spec: &TaskSpec) -> Result<Vec<Reason>, Refusal> {
-        let Some(robot_id) = &spec.robot_id else { return Ok(Vec::new()) };
-        let keys = [Table::RobotIdentity, Table::Session].map(|table| Key::new(table, robot_id.as_str()));
-        let known = !self.store().get(keys.to_vec()).await.map_err(unavailable)?.is_empty();
-        let note = Reason::from(Code::PinnedRobotUnknown).with("robot_id", robot_id);
-        Ok(if known { Vec::new() } else { vec![note] })
+        let unknown = unknown_robot(self.store(), spec.robot_id.as_slice()).await?;
+        let note = |robot_id| Reason::from(Code::PinnedRobotUnknown).with("robot_id", robot_id);
+        Ok(unknown.map(note).into_iter().collect())
     }
 
     /// Admits one task.

@@ -5,7 +5,7 @@
 
 use crate::TaskService;
 use crate::ask::{Asked, hash, internal, reason_text, request_id};
-use crate::rows::unavailable;
+use crate::rows::{unavailable, unknown_robot};
 use midshift_core::fleet::rows::HoldToken;
 use midshift_core::fleet::stops::Hold;
 use midshift_core::identity::Caller;
@@ -93,8 +93,11 @@ impl TaskService {
         let same = v1::ResumeHeldRequest { request_id: String::new(), validate_only: false, ..r.clone() };
         let hash = hash("resume", &same);
         let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
-        if let Some(named) = Named::beside(&ask).filter(|_| earlier.is_none()) {
-            self.must_be_known(&named).await?;
+        if earlier.is_none() {
+            self.robots_must_be_known(&ask).await?;
+            if let Some(named) = Named::beside(&ask) {
+                self.must_be_known(&named).await?;
+            }
         }
         let named = Named::of(&ask).filter(|_| earlier.is_none());
         let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.into(), robot_id: None };
@@ -112,6 +115,13 @@ impl TaskService {
         let stopped = held.map(|held| held.stopped).unwrap_or_default();
         let still_stopped = stopped.iter().take(limits::PAGE_MAX).map(ToString::to_string).collect();
         Ok(v1::ResumeHeldResponse { pending, robots, still_stopped })
+    }
+
+    /// Nobody means a robot that is not enrolled and has never connected.
+    async fn robots_must_be_known(&self, ask: &Ask) -> Result<(), Refusal> {
+        let Ask::ResumeHeld { robot_ids, .. } = ask else { return Ok(()) };
+        let Some(robot_id) = unknown_robot(self.store(), robot_ids).await? else { return Ok(()) };
+        Err(Refusal::new(Kind::NotFound, Reason::from(Code::RobotNotFound).with("robot_id", robot_id)))
     }
 
     /// Nobody means a stop that neither the copy of the stops nor any robot knows.

@@ -3,7 +3,7 @@
 use midshift_core::fleet::requests::allowed_resolutions;
 use midshift_core::fleet::rows::{RobotAuthority, RobotHolder};
 use midshift_core::identity::{Caller, Permission};
-use midshift_core::ids::TaskId;
+use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::rows::{BadRow, Key, Record, Revision, Row, Table};
 use midshift_core::site::Site;
@@ -82,6 +82,16 @@ pub async fn read(store: &dyn Store, task_id: &TaskId) -> Result<TaskRows, Refus
 /// These tasks, in this order. Left out: those that do not exist, and those with a value of a newer version.
 pub async fn read_many(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows>, Refusal> {
     join(store, ids).await.map_err(unavailable)
+}
+
+/// The first of these robots that is not enrolled and has never connected.
+pub async fn unknown_robot<'r>(store: &dyn Store, robot_ids: &'r [RobotId]) -> Result<Option<&'r RobotId>, Refusal> {
+    let mut keys = Vec::new();
+    for table in [Table::RobotIdentity, Table::Session] {
+        keys.extend(robot_ids.iter().map(|id| Key::new(table, id.as_str())));
+    }
+    let known = by_id(store, keys).await.map_err(unavailable)?;
+    Ok(robot_ids.iter().find(|id| !known.contains_key(id.as_str())))
 }
 
 async fn by_id(store: &dyn Store, keys: Vec<Key>) -> Result<BTreeMap<String, Row>, Error> {

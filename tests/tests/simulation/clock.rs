@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Duration;
 
 /// UTC at the beginning of each run, unix milliseconds.
-const BEGIN_UNIX_MS: i64 = 1_790_000_000_000;
+pub const BEGIN_UNIX_MS: i64 = 1_790_000_000_000;
 
 /// True time: the simulated network's own, or what the loop around it last noted.
 #[derive(Clone, Debug, Default)]

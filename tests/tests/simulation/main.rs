@@ -25,7 +25,9 @@ mod run;
 mod software;
 mod stopped;
 mod stops;
+mod wall;
 mod worker;
+mod wrong_clock;
 
 use midshift::server::Naive as Server;
 use midshift_agent::bugs::{Bugs, SeededBug};

@@ -11,6 +11,7 @@ use crate::net::{self, Ear, SERVER, SimDial, Wire};
 use crate::observer::Shared;
 use crate::software::Software;
 use crate::stops::Stops;
+use crate::wall::ServerWall;
 use midshift::roles::Roles;
 use midshift::server::{Parts, Server};
 use midshift_agent::body::Body;
@@ -88,6 +89,8 @@ pub struct Room {
     pub sim: turmoil::Sim<'static>,
     /// True time.
     pub time: TrueTime,
+    /// The wall of the server's machine.
+    pub wall: ServerWall,
     /// The witness.
     pub observer: Shared,
     /// The bodies.
@@ -123,17 +126,10 @@ pub const CLIENT: &str = "client";
 impl Room {
     /// Sets everything up; nothing has run yet.
     pub fn open(config: &RoomConfig) -> anyhow::Result<Self> {
-        let mut sim = turmoil::Builder::new()
-            .rng_seed(config.seed)
-            .simulation_duration(LONGEST)
-            .tick_duration(TICK)
-            .min_message_latency(Duration::from_millis(1))
-            .max_message_latency(Duration::from_millis(config.latency_ms.max(2)))
-            .tcp_capacity(4_096)
-            .enable_random_order()
-            .build();
+        let mut sim = network(config);
         let (time, site) = (TrueTime::default(), Arc::new(text::parse(&config.site)?));
-        let clock = MachineClock::boot(&time, Skew::default());
+        let wall = ServerWall::new(&time);
+        let clock = wall.boot();
         let store_id = StoreId(Arc::from(format!("store-{}", config.seed)));
         let store = Arc::new(MemoryStore::new(site.site_id().clone(), store_id, clock.clone()));
         let observer = Shared::new(time.clone(), store.clone());
@@ -149,7 +145,7 @@ impl Room {
         observer.look().changes().watch(keys, software.signed.clone(), hall.robots());
         let stop = if config.stops { Some(Stops::open(&mut sim, &time, &site, config.robots)?) } else { None };
         let folder = stop.as_ref().map(Stops::folder);
-        serve(&mut sim, &time, &site, disk.clone(), frames, config, &wire, &software, folder);
+        serve(&mut sim, &wall, &site, disk.clone(), frames, config, &wire, &software, folder);
         let ears: Vec<Ear> = (0..config.robots).map(|_| Ear::default()).collect();
         let launched: Vec<_> = hall.robots().iter().map(|body| Arc::new(Launched::new(None, body))).collect();
         for (robot, ear) in ears.iter().enumerate() {
@@ -178,8 +174,23 @@ impl Room {
         let desk = Rc::new(client::Desk::default());
         let of_client = desk.clone();
         sim.host(CLIENT, move || client::run(of_client.clone()));
-        let stops = vec![None; config.robots];
-        Ok(Self { sim, time, observer, hall, disk, desk, ears, wire, stop, software, store, launched, stops, steps: 0 })
+        Ok(Self {
+            sim,
+            time,
+            wall,
+            observer,
+            hall,
+            disk,
+            desk,
+            ears,
+            wire,
+            stop,
+            software,
+            store,
+            launched,
+            stops: vec![None; config.robots],
+            steps: 0,
+        })
     }
     /// True time so far, milliseconds.
     pub fn now_ms(&self) -> u64 {
@@ -266,10 +277,22 @@ impl Room {
     }
 }
 
+fn network(config: &RoomConfig) -> turmoil::Sim<'static> {
+    turmoil::Builder::new()
+        .rng_seed(config.seed)
+        .simulation_duration(LONGEST)
+        .tick_duration(TICK)
+        .min_message_latency(Duration::from_millis(1))
+        .max_message_latency(Duration::from_millis(config.latency_ms.max(2)))
+        .tcp_capacity(4_096)
+        .enable_random_order()
+        .build()
+}
+
 #[expect(clippy::too_many_arguments, reason = "everything that a server stands on in this room, once")]
 fn serve(
     sim: &mut turmoil::Sim<'static>,
-    time: &TrueTime,
+    wall: &ServerWall,
     site: &Arc<Site>,
     disk: Arc<ServerDisk>,
     frames: Arc<dyn FrameLog>,
@@ -279,13 +302,13 @@ fn serve(
     stops: Option<PathBuf>,
 ) {
     let (naive, planners, site_text) = (config.naive, config.planners, config.site.clone());
-    let (time, site, wire, software) = (time.clone(), site.clone(), wire.clone(), software.clone());
+    let (wall, site, wire, software) = (wall.clone(), site.clone(), wire.clone(), software.clone());
     sim.host(SERVER, move || {
-        let (time, site, disk, frames) = (time.clone(), site.clone(), disk.clone(), frames.clone());
+        let (wall, site, disk, frames) = (wall.clone(), site.clone(), disk.clone(), frames.clone());
         let (wire, software, site_text, stops) = (wire.clone(), software.clone(), site_text.clone(), stops.clone());
         async move {
             loop {
-                let clock = MachineClock::boot(&time, Skew::default());
+                let clock = wall.boot();
                 let ota = software.open(clock.clone()).await?;
                 let parts = Parts {
                     stop_port: None,

@@ -1,5 +1,6 @@
 //! What may be published, what is kept, and that a cut at any write leaves something that robots believe.
 
+mod anew;
 mod key_sets;
 mod unread;
 

@@ -278,7 +278,8 @@ impl Loop {
 
     /// One turn of the process that plans.
     async fn lead(&mut self, requests: Vec<Request>) -> Result<bool, ()> {
-        let now = self.parts.clock.now();
+        let undoubted = self.parts.clock.undoubted();
+        let now = undoubted.unwrap_or_else(|_| self.parts.clock.now());
         let mut plan = Plan::default();
         let unreadable = |error| tracing::warn!(%error, "roll-outs cannot read the feed");
         let foreign = self.take_feed(now, &mut plan).await.map_err(unreadable)?;
@@ -306,7 +307,11 @@ impl Loop {
         }
         let replies = self.take_requests(requests, now, &mut plan);
         // The service looks for one each second.
-        let key = opened.repository.directive_key().map_err(|keyless| keyless.reason().code);
+        let key = match undoubted {
+            Ok(_) => opened.repository.directive_key().map_err(|keyless| keyless.reason().code),
+            // Orders would have the time of this turn, though the wall may be right again.
+            Err(_) => Err(Code::ClockDoubted),
+        };
         let heard = std::mem::take(&mut self.heard);
         let more = {
             let signer = key.as_deref().map(Signer);

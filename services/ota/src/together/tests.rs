@@ -19,6 +19,7 @@ use midshift_store::StoreId;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::SystemTime;
 use tempfile::TempDir;
 use tokio_stream::StreamExt;
@@ -31,6 +32,8 @@ const UNNAMED_MS: u64 = 1_000_000;
 struct Site {
     dir: TempDir,
     quota_bytes: u64,
+    /// Of the clock of every process.
+    us: Arc<AtomicU64>,
 }
 
 impl Site {
@@ -40,7 +43,7 @@ impl Site {
     fn with_quota(quota_bytes: u64) -> Self {
         let dir = TempDir::new().expect("a folder");
         write_keys(&dir.path().join("keys"));
-        Self { dir, quota_bytes }
+        Self { dir, quota_bytes, us: Arc::default() }
     }
     fn folder(&self) -> PathBuf {
         self.dir.path().join("volume")
@@ -53,11 +56,12 @@ impl Site {
     }
     /// A process that starts now.
     async fn process(&self) -> OtaService {
+        let us = self.us.clone();
         let parts = Parts {
             folder: self.folder(),
             keys: self.dir.path().join("keys"),
             room: Room { unnamed_ms: UNNAMED_MS, ..Room::of(self.quota_bytes) },
-            clock: Arc::new(ScaledClock::new(|| 0, START, 1000)),
+            clock: Arc::new(ScaledClock::new(move || us.load(Relaxed), START, 1000)),
             owner: Owner::Shared { store_id: self.id(), known_bundles: 0 },
         };
         OtaService::open(parts).await.expect("a service")
@@ -254,6 +258,7 @@ async fn freshness_is_signed_by_one_of_them_and_its_versions_never_fork() {
     let mut trusted = robot();
     for half_day in 1..=6_u64 {
         let now = START.plus_ms(half_day * FRESHEN_AFTER_MS);
+        site.us.store(half_day * FRESHEN_AFTER_MS * 1000, Relaxed);
         let (signs, comes_late) = if half_day % 2 == 0 { (&one, &two) } else { (&two, &one) };
         opened(signs).repository.freshen(now).await.expect("signed");
         let told = opened(comes_late).repository.freshen(now).await.expect("looked");

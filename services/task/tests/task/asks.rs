@@ -194,6 +194,25 @@ async fn a_resume_before_the_reset_is_refused_and_is_not_kept_for_later() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_resume_of_a_robot_that_nobody_knows_is_refused_and_is_not_kept_for_later() {
+    let world = World::new().await;
+    world.enrols(&["r1"]).await;
+    let request = |ids: &[&str]| ResumeHeldRequest {
+        robot_ids: ids.iter().map(|id| (*id).to_owned()).collect(),
+        reason: "clear".into(),
+        ..ResumeHeldRequest::default()
+    };
+    for (ids, validate_only) in [(["r1", "r9"], false), (["r9", "r1"], true)] {
+        let refused = world.service.resume_held(local(ResumeHeldRequest { validate_only, ..request(&ids) })).await;
+        let refused = refused.expect_err("nobody knows r9");
+        assert_eq!((refused.code(), reason(&refused).as_str()), (Code::NotFound, "ROBOT_NOT_FOUND"));
+    }
+    let asked = world.store.list(Query::all(TaskRequest::TABLE)).await.expect("a store that answers");
+    assert!(asked.is_empty(), "nothing is kept for later");
+    world.service.resume_held(local(request(&["r1"]))).await.expect("it has never connected and is enrolled");
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_resume_right_after_the_reset_waits_until_fleet_has_seen_it() {
     let world = World::new().await;
     world.copies_stop("STOP-1", true).await;
@@ -217,6 +236,7 @@ async fn a_resume_names_the_robots_that_it_does_not_let_go() {
     world.fleet_holds(None, "stop:STOP-1").await;
     let answer = world.service.resume_held(local(resume("STOP-1"))).await.expect("durable").into_inner();
     assert_eq!((answer.robots, answer.still_stopped), (Some(0), vec!["r1".to_owned()]));
+    world.enrols(&["r2"]).await;
     let others = ResumeHeldRequest { robot_ids: vec!["r2".into()], ..resume("STOP-1") };
     let answer = world.service.resume_held(local(others)).await.expect("durable").into_inner();
     assert_eq!((answer.robots, answer.still_stopped.len()), (Some(0), 0), "of those that it names");

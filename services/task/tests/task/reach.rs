@@ -221,6 +221,7 @@ async fn what_is_held_is_let_go_where_the_caller_operates() {
     }
     world.store.commit(vec![item]).await.pop().expect("a result").expect("applied");
     world.copies_stop("STOP-1", true).await;
+    world.enrols(&["r1", "r2"]).await;
     let resume = async |by: &Caller, change: &dyn Fn(&mut v1::ResumeHeldRequest)| {
         let mut request = v1::ResumeHeldRequest { reason: "clear".into(), ..Default::default() };
         change(&mut request);

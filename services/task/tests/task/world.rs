@@ -2,6 +2,7 @@
 
 use midshift_core::fleet::rows::HoldToken;
 use midshift_core::fleet::{Board, LOGS, Plan, absorb, view, view::View};
+use midshift_core::identity::RobotIdentity;
 use midshift_core::ids::{AttemptId, RobotId, SiteId, StopId, Subject, TaskId};
 use midshift_core::robot::StopLevel;
 use midshift_core::rows::{Item, Key, Record, Revision, Seq, Writer};
@@ -122,6 +123,15 @@ impl World {
         }
         let (_, revision) = self.state(&task.id()).await;
         item.update(task, revision, "task.changed");
+        self.store.commit(vec![item]).await.pop().expect("a result").expect("applied");
+    }
+    /// Robots that are enrolled.
+    pub async fn enrols(&self, robots: &[&str]) {
+        let mut item = Item::new(Writer::Identity, "anna");
+        for robot in robots {
+            let robot = RobotIdentity::new(RobotId::parse(robot).expect("an id"));
+            item.create(&robot, "robot.enrolled");
+        }
         self.store.commit(vec![item]).await.pop().expect("a result").expect("applied");
     }
     /// The copy of a fleet stop that was engaged, and reset if so.

@@ -18,27 +18,45 @@ use midshift_core::rollout::bugs::Bugs;
 use midshift_core::rollout::rows::{Bundle, OtaMark, Phase, Rollout};
 use midshift_core::rows::{Item, Log, Record, Revision, Table, Writer};
 use midshift_core::site::{DEMO, Site, text};
-use midshift_core::time::{Clock, ScaledClock};
+use midshift_core::time::{Clock, Now, ScaledClock};
 use midshift_proto::access::local;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::bundle_service_server::BundleService as Bundles;
 use midshift_proto::ota::v1::rollout_service_server::RolloutService as Face;
 use midshift_store::{Error, LiveBoard, MemoryStore, Retention, Store, StoreId};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Duration;
 use tempfile::TempDir;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
-/// So long after the beginning of a test what is published in it has to be signed anew: it was made at [`START`].
+/// So long after [`World::half_a_day_passes`] what was published before it has to be signed anew.
 const DUE_MS: u64 = 60_000;
+
+/// A clock whose wall may be moved on.
+struct MovedOn {
+    clock: Arc<dyn Clock>,
+    by_ms: Arc<AtomicU64>,
+}
+
+impl Clock for MovedOn {
+    fn now(&self) -> Now {
+        let now = self.clock.now();
+        Now { wall: now.wall.plus_ms(self.by_ms.load(Relaxed)), ..now }
+    }
+    fn rate_permille(&self) -> u32 {
+        self.clock.rate_permille()
+    }
+}
 
 /// What the processes share.
 struct World {
     dir: TempDir,
     store: Arc<MemoryStore>,
     clock: Arc<dyn Clock>,
+    by_ms: Arc<AtomicU64>,
     site: Arc<Site>,
 }
 
@@ -55,11 +73,16 @@ impl World {
         let dir = TempDir::new().expect("a folder");
         write_keys(&dir.path().join("keys"));
         let begun = Instant::now();
-        let base = START.plus_ms(FRESHEN_AFTER_MS - DUE_MS);
-        let clock: Arc<dyn Clock> = Arc::new(ScaledClock::new(move || begun.elapsed().as_micros() as u64, base, 1000));
+        let (clock, by_ms) =
+            (ScaledClock::new(move || begun.elapsed().as_micros() as u64, START, 1000), Arc::default());
+        let clock: Arc<dyn Clock> = Arc::new(MovedOn { clock: Arc::new(clock), by_ms: Arc::clone(&by_ms) });
         let site = Arc::new(text::parse(DEMO).expect("the demo reads"));
         let store = MemoryStore::new(site.site_id().clone(), StoreId(Arc::from("store")), clock.clone()).shared();
-        Self { dir, store: Arc::new(store), clock, site }
+        Self { dir, store: Arc::new(store), clock, by_ms, site }
+    }
+    /// What is published before this is due to be signed anew [`DUE_MS`] after it.
+    fn half_a_day_passes(&self) {
+        self.by_ms.store(FRESHEN_AFTER_MS - DUE_MS, Relaxed);
     }
 
     async fn process(&self) -> Process {
@@ -187,6 +210,7 @@ async fn what_was_signed_is_signed_anew_by_the_leader_alone() {
     let world = World::new();
     let leader = world.process().await;
     release(&leader.ota, &files("walk", "1.0.0")).await;
+    world.half_a_day_passes();
     let standby = world.process().await;
     secs(5 * 60).await;
     // Had the standby signed as well, there would be a third.
@@ -201,6 +225,7 @@ async fn what_was_signed_by_a_leader_that_was_killed_is_signed_anew_by_whoever_f
     let world = World::new();
     let leader = world.process().await;
     release(&leader.ota, &files("walk", "1.0.0")).await;
+    world.half_a_day_passes();
     let standby = world.process().await;
     let first = world.holder().await;
     leader.kill();
