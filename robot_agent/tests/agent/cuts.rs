@@ -8,7 +8,7 @@ use midshift_agent::sets::Sets;
 use midshift_core::update::{ActivationGrant, Goal, UpdateReport, UpdateState};
 
 /// What the server would say now, whatever was lost: level-triggered.
-fn server_says(rig: &mut Rig, order: &mut Order, grants: &mut u64, back: bool) {
+pub fn server_says(rig: &mut Rig, order: &mut Order, grants: &mut u64, back: bool) {
     let at = state(rig);
     order.generation += 10;
     let idle = matches!(at, Some(UpdateState::Trial | UpdateState::Committed | UpdateState::RolledBack));
