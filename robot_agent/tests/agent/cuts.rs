@@ -1,9 +1,9 @@
 //! The power goes at every effect of an update, and the set on trial may die when it comes back.
 
 use crate::bases::{a_day_passes, migrations};
-use crate::rig::Rig;
+use crate::rig::{Rig, now_at};
 use crate::updates::{Order, committed, connected, drain, maintain, name_of, report, state, switch, want};
-use midshift_agent::core::ExitReason;
+use midshift_agent::core::{ExitReason, Input};
 use midshift_agent::sets::Sets;
 use midshift_core::update::{ActivationGrant, Goal, UpdateReport, UpdateState};
 
@@ -110,8 +110,16 @@ fn all_agree(rig: &mut Rig, told: &UpdateReport, good: &str) {
     assert_eq!((record.running(), record.trial.as_ref()), (runs, None), "{told:?}");
     let ledger = rig.store.kept().expect("loaded").ledger.software.update.expect("an update");
     assert_eq!((ledger.state, ledger.set_name().as_deref()), (told.state, Some(set.as_str())));
-    let heard = rig.reported.as_ref().and_then(|reported| reported.update.as_ref()).expect("a heartbeat says it");
+    let heard = opens_with(rig).expect("a session begins with it");
     assert_eq!((heard.state, &heard.set), (told.state, &told.set));
+}
+
+/// What a session of the robot begins with saying of its update: heartbeats leave out what is over. It is connected then.
+pub fn opens_with(rig: &mut Rig) -> Option<UpdateReport> {
+    rig.put(Input::Disconnected);
+    let hello = rig.core.reported(&now_at(rig.ms));
+    rig.connect();
+    hello.update
 }
 
 /// Whatever the launcher would start now is whole.

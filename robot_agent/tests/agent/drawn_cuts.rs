@@ -7,7 +7,7 @@
 //! seed is the same run each time; one that fails says how it is played again. `cargo xtask torture updates` plays more.
 
 use crate::bases::a_day_passes;
-use crate::cuts::server_says;
+use crate::cuts::{opens_with, server_says};
 use crate::machine::Machine;
 use crate::release::{Bundle, Releases, component};
 use crate::rig::Rig;
@@ -17,7 +17,8 @@ use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::switch::FACTORY;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::{ComponentKind, Needs};
-use midshift_core::update::{UpdateReport, UpdateState};
+use midshift_core::update::{UpdateEvent, UpdateReport, UpdateState};
+use midshift_core::work::RobotEvent;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::collections::BTreeMap;
@@ -130,16 +131,25 @@ struct Shift {
     /// Number of the newest directive.
     directive: u64,
     grants: u64,
+    /// What the server heard last of an update, over all sessions.
+    heard: Option<UpdateReport>,
     met: Met,
 }
 
 impl Shift {
     /// A robot as it came, under its launcher.
     fn begin() -> (Self, Rig) {
-        let (releases, bundles) = (Releases::new(), Vec::new());
+        let releases = Releases::new();
         let rig = Rig::updatable(&releases);
-        let mut this =
-            Self { releases, bundles, machine: Machine::new(), directive: 0, grants: 1_000_000, met: Met::new() };
+        let mut this = Self {
+            releases,
+            bundles: Vec::new(),
+            machine: Machine::new(),
+            directive: 0,
+            grants: 0,
+            heard: None,
+            met: Met::new(),
+        };
         let rig = this.start_again(rig);
         (this, rig)
     }
@@ -176,6 +186,7 @@ impl Shift {
 
     /// The launcher starts the agent again.
     fn start_again(&mut self, mut rig: Rig) -> Rig {
+        self.listen(&mut rig);
         let (is_doubled, killed) = (self.machine.is_doubled, self.machine.killed);
         let disk = self.machine.start(&self.bundles);
         self.meet("second launcher refused", u64::from(is_doubled));
@@ -185,6 +196,15 @@ impl Shift {
         let mut rig = rig.restart();
         rig.connect();
         rig
+    }
+
+    /// Takes in what the robot has told of its update.
+    fn listen(&mut self, rig: &mut Rig) {
+        for event in rig.events.drain(..) {
+            if let RobotEvent::Update(UpdateEvent::Changed(report)) = event {
+                self.heard = Some(report);
+            }
+        }
     }
 
     /// The power is gone. This is wrong when it comes back.
@@ -259,24 +279,27 @@ impl Shift {
         panic!("never ended: {:?}, {:?}", report(&rig), self.machine.record());
     }
 
-    /// What runs, the switch record, the ledger and the newest heartbeat say the same of an update that is over; how it
-    /// ended.
-    fn agree(&self, rig: &Rig, bundle: &Bundle, good: &str) -> UpdateState {
-        let told = told(rig, bundle).expect("an update");
-        let set = told.set.as_ref().map(ToString::to_string).expect("a set");
-        let is_kept = told.state == UpdateState::Committed;
+    /// What runs, the switch record, the ledger and all that the server is told say the same of an update that is over; how
+    /// it ended.
+    fn agree(&mut self, rig: &mut Rig, bundle: &Bundle, good: &str) -> UpdateState {
+        let ledger = rig.store.kept().expect("loaded").ledger.software.update.expect("an update");
+        let set = ledger.set_name().expect("a set");
+        let is_kept = ledger.state == UpdateState::Committed;
         let runs = if is_kept { set.as_str() } else { good };
         let record = self.machine.record();
-        assert_eq!((self.machine.started.as_str(), record.running(), &record.trial), (runs, runs, &None), "{told:?}");
-        assert!(self.machine.is_on_its_base(), "{runs} runs on another base: {told:?}");
+        assert_eq!((self.machine.started.as_str(), record.running(), &record.trial), (runs, runs, &None), "{ledger:?}");
+        assert!(self.machine.is_on_its_base(), "{runs} runs on another base: {ledger:?}");
         if is_kept {
             assert_eq!(record.kept(), Some(good), "the way back is to the set committed before");
         }
-        let ledger = rig.store.kept().expect("loaded").ledger.software.update.expect("an update");
-        assert_eq!((ledger.state, ledger.set_name().as_deref()), (told.state, Some(set.as_str())));
-        let heard = rig.reported.as_ref().and_then(|reported| reported.update.as_ref()).expect("a heartbeat says it");
-        assert_eq!((heard.state, &heard.bundle, &heard.set), (told.state, &told.bundle, &told.set));
-        told.state
+        self.listen(rig);
+        let said = [self.heard.clone(), opens_with(rig)].map(|report| report.expect("it says how the update ended"));
+        for report in said {
+            let its_set = report.set.as_ref().map(ToString::to_string);
+            assert_eq!((report.state, its_set.as_deref()), (ledger.state, Some(set.as_str())));
+            assert_eq!(report.bundle.as_str(), bundle.digest.to_string());
+        }
+        ledger.state
     }
 }
 
@@ -319,14 +342,14 @@ fn play(seed: u64) -> Met {
     let first = shift.release("1.1.0", plan.has_base);
     let before = effects(&rig);
     let mut rig = shift.update(rig, &first, false, &[], 0);
-    assert_eq!(shift.agree(&rig, &first, FACTORY), UpdateState::Committed);
+    assert_eq!(shift.agree(&mut rig, &first, FACTORY), UpdateState::Committed);
     let (undisturbed, good) = (effects(&rig) - before, shift.machine.started.clone());
     if plan.has_base {
         a_day_passes(&mut rig, &shift.releases);
     }
     let second = shift.release("1.2.0", plan.has_base);
-    let rig = shift.update(rig, &second, plan.back, &plan.blows, undisturbed);
-    let end = shift.agree(&rig, &second, &good);
+    let mut rig = shift.update(rig, &second, plan.back, &plan.blows, undisturbed);
+    let end = shift.agree(&mut rig, &second, &good);
     let died = shift.machine.dying.take().is_some();
     let was_put_away = std::mem::take(&mut shift.machine.put_away);
     if plan.back || died {
@@ -338,8 +361,8 @@ fn play(seed: u64) -> Met {
     shift.meet(if end == UpdateState::Committed { "update committed" } else { "update rolled back" }, 1);
     let good = shift.machine.started.clone();
     let third = shift.release("1.3.0", false);
-    let rig = shift.update(rig, &third, false, &[], 0);
-    assert_eq!(shift.agree(&rig, &third, &good), UpdateState::Committed, "it takes the next release");
+    let mut rig = shift.update(rig, &third, false, &[], 0);
+    assert_eq!(shift.agree(&mut rig, &third, &good), UpdateState::Committed, "it takes the next release");
     shift.met
 }
 
