@@ -1,10 +1,11 @@
-//! Updates while everything happens to the robot's machine, drawn from a seed: the power goes at an effect of the agent,
-//! and at the next start the set on trial may be unable to live, the disk full, the wall clock wrong, and a second launcher
-//! there.
+//! Updates while everything happens to the robot's machine, drawn from a seed: the power goes at an effect of the
+//! agent, and at the next start the set on trial may be unable to live, the disk full, the wall clock wrong, and a
+//! second launcher there.
 //!
-//! The agent is the one of the bench, over sets on a disk; every start is the real launcher's. Invariant: each start is of
-//! a whole, signed set; each update ends; ledger, switch record and report then say the same; the next release is taken. A
-//! seed is the same run each time; one that fails says how it is played again. `cargo xtask torture updates` plays more.
+//! The agent is the one of the bench, over sets on a disk; every start is the real launcher's. Invariant: each start
+//! is of a whole, signed set; each update ends; ledger, switch record and report then say the same; the next release
+//! is taken. A seed is the same run each time; one that fails says how it is played again. `cargo xtask torture
+//! updates` plays more.
 
 use crate::bases::a_day_passes;
 use crate::cuts::{opens_with, server_says};
@@ -279,8 +280,8 @@ impl Shift {
         panic!("never ended: {:?}, {:?}", report(&rig), self.machine.record());
     }
 
-    /// What runs, the switch record, the ledger and all that the server is told say the same of an update that is over; how
-    /// it ended.
+    /// What runs, the switch record, the ledger and all that the server is told say the same of an update that is
+    /// over; how it ended.
     fn agree(&mut self, rig: &mut Rig, bundle: &Bundle, good: &str) -> UpdateState {
         let ledger = rig.store.kept().expect("loaded").ledger.software.update.expect("an update");
         let set = ledger.set_name().expect("a set");

@@ -1,5 +1,5 @@
-//! The machine of a robot on the bench: a folder of sets, the real launcher that starts one of them, and what may be wrong
-//! at a start.
+//! The machine of a robot on the bench: a folder of sets, the real launcher that starts one of them, and what may be
+//! wrong at a start.
 //!
 //! Invariant: a start fails unless what it starts, and what is kept beside that, is whole and of signed bundles.
 
@@ -53,8 +53,8 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// One that was never started. It lies in memory where that can be had: nothing here depends on what a disk loses with
-    /// the power.
+    /// One that was never started. It lies in memory where that can be had: nothing here depends on what a disk loses
+    /// with the power.
     pub fn new() -> Self {
         Self {
             home: tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).expect("a folder"),
