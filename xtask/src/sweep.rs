@@ -1,8 +1,9 @@
 //! Long sweeps and golden files: calls of `cargo test` with an environment variable that the tests read.
 //!
 //! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs and by stories, `MIDSHIFT_STORY` by
-//! stories, `MIDSHIFT_SEEDS` and `MIDSHIFT_SEED_FROM` by the simulation and by players over sockets, `MIDSHIFT_SPLIT_ROBOTS` by the split stack, `MIDSHIFT_OLD_TASKS` by
-//! old sites, `MIDSHIFT_SITES` by the power cuts and kills at calls, `BLESS` by tests with `golden` in their name.
+//! stories, `MIDSHIFT_SEEDS` and `MIDSHIFT_SEED_FROM` by the simulation, by players over sockets and by drawn cuts of updates,
+//! `MIDSHIFT_SPLIT_ROBOTS` by the split stack, `MIDSHIFT_OLD_TASKS` by old sites, `MIDSHIFT_SITES` by the power cuts and kills at calls, `BLESS`
+//! by tests with `golden` in their name.
 
 use crate::fetch_tools::Tools;
 use crate::parts::{self, Count};
@@ -31,7 +32,8 @@ pub enum Sweep {
     /// A process of each service of a split stack killed or replaced in turn while 200 robots work and a release goes out to them, and then a bad one; as
     /// often as --seeds says, it draws nothing.
     Split,
-    /// The power goes at each call of an update, and of the ways back from one, that changes the disk: all of them, whatever the seeds.
+    /// Updates in which the power goes at drawn moments and the next start finds a set that dies, a full disk, a wrong clock or a second launcher; then
+    /// the power goes at each call of an update, and of the ways back from one, that changes the disk: all of them, whatever the seeds.
     Updates,
     /// The stop service, and a robot that keeps what it is told of stops, are killed at each call that changes their files: all of them, whatever the seeds.
     Latch,
@@ -65,10 +67,10 @@ impl Sweep {
         match self {
             Self::Kills => 20,
             Self::Simulation => 2_000,
-            Self::Players => 5_000,
+            Self::Players | Self::Updates => 5_000,
             Self::Sockets => 1_000,
             Self::Stops => 100,
-            Self::Split | Self::Updates | Self::Latch | Self::OldSites => 1,
+            Self::Split | Self::Latch | Self::OldSites => 1,
             Self::Stories => 2,
         }
     }
@@ -76,8 +78,9 @@ impl Sweep {
     /// Whether what it does comes of seeds.
     const fn draws(self) -> bool {
         match self {
-            Self::Kills | Self::Simulation | Self::Players | Self::Sockets | Self::Stops | Self::Stories => true,
-            Self::Split | Self::Updates | Self::Latch | Self::OldSites => false,
+            Self::Kills | Self::Simulation | Self::Players | Self::Sockets => true,
+            Self::Updates | Self::Stops | Self::Stories => true,
+            Self::Split | Self::Latch | Self::OldSites => false,
         }
     }
 
@@ -85,13 +88,16 @@ impl Sweep {
         match self {
             Self::Kills => each_seed(workspace, "kills", "kill::", from, seeds),
             Self::Stories => each_seed(workspace, "stories", "story::", from, seeds),
-            Self::Simulation => simulated(workspace, "many_seeds_keep_every_law", from, seeds),
-            Self::Players => simulated(workspace, "played::many_seeds", from, seeds),
+            Self::Simulation => seeded(workspace, "simulation", "many_seeds_keep_every_law", from, seeds),
+            Self::Players => seeded(workspace, "simulation", "played::many_seeds", from, seeds),
             Self::Sockets => over_sockets(workspace, from, seeds),
-            Self::Stops => simulated(workspace, "stopped::in_cuts_and_kills", from, seeds),
+            Self::Stops => seeded(workspace, "simulation", "stopped::in_cuts_and_kills", from, seeds),
             Self::Split => split(workspace, seeds),
             Self::OldSites => counted(test(workspace, "e2e", "old_site::").env("MIDSHIFT_OLD_TASKS", OLD_TASKS)),
-            Self::Updates => every_site(workspace, "agent", "power::"),
+            Self::Updates => {
+                let drawn = seeded(workspace, "agent", "drawn_cuts::", from, seeds)?;
+                Ok(drawn && every_site(workspace, "agent", "power::")?)
+            }
             Self::Latch => {
                 Ok(every_site(workspace, "stop", "killed::")? && every_site(workspace, "agent", "stop_cuts::")?)
             }
@@ -135,8 +141,9 @@ fn over_sockets(workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
     counted(command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string()))
 }
 
-fn simulated(workspace: &Workspace, filter: &str, from: u64, seeds: u64) -> Result<bool> {
-    let mut command = test(workspace, "simulation", filter);
+/// Tests that play as many seeds as their environment says.
+fn seeded(workspace: &Workspace, target: &str, filter: &str, from: u64, seeds: u64) -> Result<bool> {
+    let mut command = test(workspace, target, filter);
     counted(command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string()))
 }
 
@@ -202,6 +209,6 @@ mod tests {
         assert_eq!(first_seed(&[], Some(7)).expect("some draw"), 7);
         assert_eq!(first_seed(&[Sweep::Split, Sweep::Kills], Some(7)).expect("one draws"), 7);
         assert_eq!(first_seed(&[Sweep::Split], None).expect("no seed"), 1);
-        assert!(first_seed(&[Sweep::Split, Sweep::Updates], Some(7)).is_err());
+        assert!(first_seed(&[Sweep::Split, Sweep::Latch], Some(7)).is_err());
     }
 }

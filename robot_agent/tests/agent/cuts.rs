@@ -8,7 +8,7 @@ use midshift_agent::sets::Sets;
 use midshift_core::update::{ActivationGrant, Goal, UpdateReport, UpdateState};
 
 /// What the server would say now, whatever was lost: level-triggered.
-fn server_says(rig: &mut Rig, order: &mut Order, grants: &mut u64, back: bool) {
+pub fn server_says(rig: &mut Rig, order: &mut Order, grants: &mut u64, back: bool) {
     let at = state(rig);
     order.generation += 10;
     let idle = matches!(at, Some(UpdateState::Trial | UpdateState::Committed | UpdateState::RolledBack));
@@ -110,9 +110,16 @@ fn all_agree(rig: &mut Rig, told: &UpdateReport, good: &str) {
     assert_eq!((record.running(), record.trial.as_ref()), (runs, None), "{told:?}");
     let ledger = rig.store.kept().expect("loaded").ledger.software.update.expect("an update");
     assert_eq!((ledger.state, ledger.set_name().as_deref()), (told.state, Some(set.as_str())));
+    let heard = opens_with(rig).expect("a session begins with it");
+    assert_eq!((heard.state, &heard.set), (told.state, &told.set));
+}
+
+/// What a session of the robot begins with saying of its update: heartbeats leave out what is over. It is connected then.
+pub fn opens_with(rig: &mut Rig) -> Option<UpdateReport> {
     rig.put(Input::Disconnected);
-    let hello = rig.core.reported(&now_at(rig.ms)).update.expect("the next Hello says it");
-    assert_eq!((hello.state, &hello.set), (told.state, &told.set));
+    let hello = rig.core.reported(&now_at(rig.ms));
+    rig.connect();
+    hello.update
 }
 
 /// Whatever the launcher would start now is whole.

@@ -3,8 +3,10 @@
 mod bases;
 mod beside;
 mod chaos;
+mod crowded;
 mod cuts;
 mod device;
+mod drawn_cuts;
 mod drives;
 mod durability;
 mod forward;
@@ -12,6 +14,7 @@ mod full;
 mod key_sets;
 mod lanes;
 mod loads;
+mod machine;
 mod offers;
 mod power;
 mod release;

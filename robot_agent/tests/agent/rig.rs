@@ -1,10 +1,12 @@
 //! A robot on a bench: the core with a body that does what the test says, a store that keeps, and a server that is the test.
 
+use crate::crowded::CrowdedSets;
 use crate::release::Releases;
 use midshift_agent::body::{Body, BodyLimits, BodyNews, BodyOrder, BodyState, Checked, PathPoint};
 use midshift_agent::bugs::Bugs;
 use midshift_agent::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
 use midshift_agent::memory::MemoryStore;
+use midshift_agent::sets::Sets;
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::stop::keep::Loaded;
 use midshift_agent::stop::{CheckIn, StopNews};
@@ -259,6 +261,8 @@ pub struct StopDesk {
 pub struct Updates {
     pub releases: Releases,
     pub sets: MemorySets,
+    /// Used instead of `sets` where a test wants real files.
+    pub disk: Option<CrowdedSets>,
     /// Effects (commits and jobs) so far.
     pub effects: usize,
     /// The effect at which the power goes.
@@ -270,6 +274,10 @@ pub struct Updates {
     pub jobs: Vec<Job>,
     /// Calls of programs that migrate do not end well.
     pub migration_fails: bool,
+    /// The ledger has no room: an agent that writes to it ends.
+    pub ledger_is_full: bool,
+    /// How far the wall clock is from the truth, milliseconds.
+    pub jumped_ms: i64,
 }
 
 impl Updates {
@@ -278,12 +286,15 @@ impl Updates {
         Self {
             releases,
             sets,
+            disk: None,
             effects: 0,
             cut_at: None,
             last_is_done: false,
             dark: false,
             jobs: Vec::new(),
             migration_fails: false,
+            ledger_is_full: false,
+            jumped_ms: 0,
         }
     }
     fn work(&self, job: Job) -> Done {
@@ -291,7 +302,11 @@ impl Updates {
             return Done::Failed(Failure::Later("exit status: 1".to_owned()));
         }
         let remote = Arc::new(self.releases.clone());
-        let mut worker = UpdateWorker::new(Box::new(self.sets.clone()), remote);
+        let sets: Box<dyn Sets> = match &self.disk {
+            Some(disk) => Box::new(disk.clone()),
+            None => Box::new(self.sets.clone()),
+        };
+        let mut worker = UpdateWorker::new(sets, remote);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
         runtime.block_on(worker.work(job, CancellationToken::new()))
     }
@@ -342,7 +357,8 @@ impl Rig {
         let update = updates.as_ref().map(|u| u.releases.config());
         let config =
             CoreConfig { robot_id: RobotId::parse("rbt-01").expect("a name"), bugs, update, server_is_proven: true };
-        let mut core = AgentCore::new(config, Box::new(body.clone()), kept, now_at(ms));
+        let now = clocks_at(ms, updates.as_ref());
+        let mut core = AgentCore::new(config, Box::new(body.clone()), kept, now);
         if stop.is_there {
             core.obeys_stops(Loaded { kept: stop.kept.clone(), is_durable: true }, LinkTime(ms));
         }
@@ -381,11 +397,12 @@ impl Rig {
     pub fn put(&mut self, input: Input) {
         let mut inputs = vec![input];
         while let Some(input) = inputs.pop() {
-            for output in self.core.step(now_at(self.ms), input) {
+            let now = clocks_at(self.ms, self.updates.as_ref());
+            for output in self.core.step(now, input) {
                 match output {
                     Output::Persist(batch, ops) if self.slow_disk => self.unwritten = Some((batch, ops)),
                     Output::Persist(batch, ops) => {
-                        let (happens, is_heard) = self.effect();
+                        let (happens, is_heard) = self.write();
                         if happens {
                             self.store.commit_now(&ops);
                         }
@@ -420,6 +437,13 @@ impl Rig {
     }
     fn effect(&mut self) -> (bool, bool) {
         self.updates.as_mut().map_or((true, true), Updates::effect)
+    }
+    /// As [`Rig::effect`], of a write to the ledger.
+    fn write(&mut self) -> (bool, bool) {
+        if let Some(updates) = &mut self.updates {
+            updates.dark |= updates.ledger_is_full;
+        }
+        self.effect()
     }
     /// Highest number of a lane that was sent.
     pub fn heard(&self, lane: Lane) -> u64 {
@@ -582,6 +606,11 @@ pub fn now_at(ms: u64) -> Now {
         wall: Utc(1_700_000_000_000 + ms as i64),
         jump: None,
     }
+}
+/// As the clocks of a machine say it whose wall may have jumped.
+fn clocks_at(ms: u64, updates: Option<&Updates>) -> Now {
+    let (now, jumped_ms) = (now_at(ms), updates.map_or(0, |updates| updates.jumped_ms));
+    Now { utc: Utc(now.utc.0 + jumped_ms), wall: Utc(now.wall.0 + jumped_ms), ..now }
 }
 pub fn ack(lane: Lane, seq: u64) -> LaneAck {
     LaneAck { lane, seq, expect: None }
