@@ -55,8 +55,8 @@ enum Verb {
         /// split and night (about a quarter of an hour) once. Updates, latch and old sites take none.
         #[arg(long)]
         seeds: Option<u64>,
-        /// The first seed of kills, simulation, stops, stories and night; unless told, 1. Split, updates and latch draw nothing and take none. A failing
-        /// seed alone: `torture kills|simulation|stops|stories|night --from SEED --seeds 1`.
+        /// The first seed of kills, simulation, stops, stories and night; unless told, 1. Split, updates and latch draw
+        /// nothing and take none. A failing seed alone: `torture kills|simulation|stops|stories|night --from SEED --seeds 1`.
         #[arg(long)]
         from: Option<u64>,
         /// What runs every night: whole stories and whole nights with four seeds each, and old sites.

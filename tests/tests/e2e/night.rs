@@ -46,7 +46,7 @@ const BATCH: usize = 4;
 const AREAS: [&str; 3] = ["hall", "packing", "quality"];
 /// The release that everybody keeps who can have it.
 const GOOD: &str = "1.5.0";
-/// What the sample releases are called.
+/// What all releases are called.
 const NAME: &str = "walk";
 /// How each roll-out watches, and whom it gives up.
 const PACE: [&str; 8] = ["--soak", "1s", "--drain-within", "120s", "--lost-after", "60s", "--complete-percent", "80"];
@@ -119,8 +119,9 @@ struct Plot {
     off_work: &'static str,
     waves: &'static str,
     bad: &'static [Bad],
-    /// Who is killed how often; so many of these kills come with each bad release.
+    /// Who is killed how often.
     blows: [(Blow, usize); 3],
+    /// So many of these kills come with each bad release.
     blows_each: usize,
     /// With a pause, a full disk and a robot that falls silent.
     is_whole: bool,
