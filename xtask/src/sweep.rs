@@ -1,9 +1,10 @@
 //! Long sweeps and golden files: calls of `cargo test` with an environment variable that the tests read.
 //!
-//! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs and by stories, `MIDSHIFT_STORY` by
-//! stories, `MIDSHIFT_SEEDS` and `MIDSHIFT_SEED_FROM` by the simulation, by players over sockets and by drawn cuts of updates,
-//! `MIDSHIFT_SPLIT_ROBOTS` by the split stack, `MIDSHIFT_OLD_TASKS` by old sites, `MIDSHIFT_SITES` by the power cuts and kills at calls, `BLESS`
-//! by tests with `golden` in their name.
+//! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs, by stories and by
+//! nights, `MIDSHIFT_STORY` by stories, `MIDSHIFT_NIGHT` by nights, `MIDSHIFT_SEEDS` and `MIDSHIFT_SEED_FROM` by the
+//! simulation, by players over sockets and by drawn cuts of updates, `MIDSHIFT_SPLIT_ROBOTS` by the split stack,
+//! `MIDSHIFT_OLD_TASKS` by old sites, `MIDSHIFT_SITES` by the power cuts and kills at calls, `BLESS` by tests with
+//! `golden` in their name.
 
 use crate::fetch_tools::Tools;
 use crate::parts::{self, Count};
@@ -41,16 +42,19 @@ pub enum Sweep {
     Stops,
     /// Twenty robots, five of them launcher and agent processes, get a good release and three bad ones: about ten minutes a seed.
     Stories,
+    /// Twelve robots under launchers at a server get a good release and three bad ones, with kills of everybody, a
+    /// freeze, a pause, a full disk and a robot that falls silent for ever: about a quarter of an hour a seed.
+    Night,
     /// Starts, takeovers, lists, pruning and backups at a site where a million tasks are over, on both engines; it draws nothing.
     OldSites,
 }
 
 /// What runs every night, and with how many seeds.
-pub const NIGHTLY: [Sweep; 2] = [Sweep::Stories, Sweep::OldSites];
+pub const NIGHTLY: [Sweep; 3] = [Sweep::Stories, Sweep::Night, Sweep::OldSites];
 pub const NIGHTLY_SEEDS: u64 = 4;
 
 impl Sweep {
-    const ALL: [Self; 10] = [
+    const ALL: [Self; 11] = [
         Self::Kills,
         Self::Simulation,
         Self::Players,
@@ -60,6 +64,7 @@ impl Sweep {
         Self::Latch,
         Self::Stops,
         Self::Stories,
+        Self::Night,
         Self::OldSites,
     ];
 
@@ -70,7 +75,7 @@ impl Sweep {
             Self::Players | Self::Updates => 5_000,
             Self::Sockets => 1_000,
             Self::Stops => 100,
-            Self::Split | Self::Latch | Self::OldSites => 1,
+            Self::Split | Self::Latch | Self::Night | Self::OldSites => 1,
             Self::Stories => 2,
         }
     }
@@ -79,7 +84,7 @@ impl Sweep {
     const fn draws(self) -> bool {
         match self {
             Self::Kills | Self::Simulation | Self::Players | Self::Sockets => true,
-            Self::Updates | Self::Stops | Self::Stories => true,
+            Self::Updates | Self::Stops | Self::Stories | Self::Night => true,
             Self::Split | Self::Latch | Self::OldSites => false,
         }
     }
@@ -88,6 +93,7 @@ impl Sweep {
         match self {
             Self::Kills => each_seed(workspace, "kills", "kill::", from, seeds),
             Self::Stories => each_seed(workspace, "stories", "story::", from, seeds),
+            Self::Night => each_seed(workspace, "night", "night::", from, seeds),
             Self::Simulation => seeded(workspace, "simulation", "many_seeds_keep_every_law", from, seeds),
             Self::Players => seeded(workspace, "simulation", "played::many_seeds", from, seeds),
             Self::Sockets => over_sockets(workspace, from, seeds),
@@ -153,7 +159,7 @@ fn each_seed(workspace: &Workspace, sweep: &str, filter: &str, from: u64, seeds:
     for seed in from..from.saturating_add(seeds) {
         let mut command = test(workspace, "e2e", filter);
         workspace.export_programs(&mut command)?;
-        command.env("MIDSHIFT_SEED", seed.to_string()).env("MIDSHIFT_STORY", "all");
+        command.env("MIDSHIFT_SEED", seed.to_string()).env("MIDSHIFT_STORY", "all").env("MIDSHIFT_NIGHT", "all");
         if !counted(&mut command)? {
             run::say(&format!("next: cargo xtask torture {sweep} --from {seed} --seeds 1"));
             return Ok(false);

@@ -43,6 +43,7 @@ mod many;
 mod measured;
 mod mid_shift;
 mod minimal_robot;
+mod night;
 mod old_site;
 mod partition;
 mod played;

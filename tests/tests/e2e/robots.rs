@@ -212,7 +212,7 @@ impl Robots {
 }
 
 /// What the machine in this folder remembers, whether or not its agent runs.
-async fn remembered(folder: &Path) -> anyhow::Result<Ledger> {
+pub async fn remembered(folder: &Path) -> anyhow::Result<Ledger> {
     let copy = tempfile::tempdir()?;
     for name in [AGENT_FILE.to_owned(), format!("{AGENT_FILE}-wal")] {
         let _ = std::fs::copy(folder.join(&name), copy.path().join(&name));

@@ -48,6 +48,18 @@ impl Robot {
         stops: Option<SocketAddr>,
         enrolment: Option<&str>,
     ) -> anyhow::Result<Self> {
+        Self::start(Self::command(id, start, home, samples, server, stops, enrolment)?, home)
+    }
+    /// What [`Robot::launch`] starts.
+    pub fn command(
+        id: &str,
+        start: &str,
+        home: &Path,
+        samples: &Path,
+        server: &str,
+        stops: Option<SocketAddr>,
+        enrolment: Option<&str>,
+    ) -> anyhow::Result<Command> {
         std::fs::create_dir_all(home)?;
         trust(samples, &text::parse(DEMO)?)?.write(&home.join("trust.json"))?;
         let (program, sets) = (midshift()?, home.join("sets"));
@@ -59,13 +71,28 @@ impl Robot {
         command.arg(&program).args(["agent", "run", "--robot-id", id, "--no-faults", "--server", server]);
         command.args(["--start", start, "--body-speed", BODY_SPEED]);
         command.arg("--data").arg(home.join("data")).arg("--sets").arg(&sets);
-        command.arg("--trust").arg(home.join("trust.json")).process_group(0);
+        command.arg("--trust").arg(home.join("trust.json"));
         match stops {
             Some(stops) => command.args(["--stop-server", &stops.to_string()]),
             None => command.arg("--no-stop"),
         };
         tell_identity(&mut command, server);
-        Ok(Self { running: Running::start(&mut command, &home.join("log"))?, sets })
+        Ok(command)
+    }
+    /// Starts what [`Robot::command`] made, or what starts that.
+    pub fn start(mut command: Command, home: &Path) -> anyhow::Result<Self> {
+        let running = Running::start(command.process_group(0), &home.join("log"))?;
+        Ok(Self { running, sets: home.join("sets") })
+    }
+    /// SIGKILL to the launcher alone.
+    pub fn kill_launcher(&mut self) -> anyhow::Result<()> {
+        self.running.kill()
+    }
+    /// Process id of the agent; none: the launcher is about to start it.
+    pub fn agent(&self) -> anyhow::Result<Option<u32>> {
+        let launcher = self.running.id();
+        let children = std::fs::read_to_string(format!("/proc/{launcher}/task/{launcher}/children"))?;
+        Ok(children.split_whitespace().next().map(str::parse::<u32>).transpose()?)
     }
     /// Its switch record.
     pub fn switch(&self) -> anyhow::Result<Switch> {
@@ -115,13 +142,18 @@ pub async fn fleet(
     }
     done(&["bundle", "push", "--server", &people, &samples.join("repository").display().to_string()])?;
     for id in &ids {
-        until("the robot is known", LIMIT, async || {
-            Ok(call(&["robot", "get", "--server", &people, id])?.status.success().then_some(()))
-        })
-        .await?;
-        keep_secrets(&dir.join(id).join("data")).await?;
+        until_known(&people, id, &dir.join(id)).await?;
     }
     Ok((robots, ids.iter().map(|id| dir.join(id).join("data/journal.jsonl")).collect()))
+}
+
+/// Waits until people can ask for a robot; nobody may be told its secrets from then on.
+pub async fn until_known(people: &str, id: &str, home: &Path) -> anyhow::Result<()> {
+    until("the robot is known", LIMIT, async || {
+        Ok(call(&["robot", "get", "--server", people, id])?.status.success().then_some(()))
+    })
+    .await?;
+    keep_secrets(&home.join("data")).await
 }
 
 /// What a robot of `site` believes that believes the release people of `samples`.
