@@ -51,11 +51,12 @@ enum Verb {
         #[arg(value_enum)]
         sweeps: Vec<sweep::Sweep>,
         /// How many seeds each, and how often split; unless told, 20 kills (about two minutes a seed), 2000 simulated shifts (about a quarter
-        /// of a second), 100 runs of stops (some seconds), 2 stories (about ten minutes) and split once. Updates, latch and old sites take none.
+        /// of a second), 100 runs of stops (some seconds), 500 shifts of each pair of versions, 2 stories (about ten minutes) and split once.
+        /// Updates, latch and old sites take none.
         #[arg(long)]
         seeds: Option<u64>,
-        /// The first seed of kills, simulation, stops and stories; unless told, 1. Split, updates and latch draw nothing and take none. A failing seed alone:
-        /// `torture kills|simulation|stops|stories --from SEED --seeds 1`.
+        /// The first seed of kills, simulation, stops, skew and stories; unless told, 1. Split, updates and latch draw nothing and take none. A
+        /// failing seed alone: `torture kills|simulation|stops|skew|stories --from SEED --seeds 1`.
         #[arg(long)]
         from: Option<u64>,
         /// What runs every night: whole stories with four seeds, and old sites.

@@ -37,6 +37,8 @@ pub enum Sweep {
     Latch,
     /// Robots at work in the deterministic simulation while stops are engaged and reset, lines to the stop service are cut, and everybody is killed.
     Stops,
+    /// Shifts with a roll-out and its way back in the deterministic simulation, of servers and agents that are one version apart.
+    Skew,
     /// Twenty robots, five of them launcher and agent processes, get a good release and three bad ones: about ten minutes a seed.
     Stories,
     /// Starts, takeovers, lists, pruning and backups at a site where a million tasks are over, on both engines; it draws nothing.
@@ -48,7 +50,7 @@ pub const NIGHTLY: [Sweep; 2] = [Sweep::Stories, Sweep::OldSites];
 pub const NIGHTLY_SEEDS: u64 = 4;
 
 impl Sweep {
-    const ALL: [Self; 10] = [
+    const ALL: [Self; 11] = [
         Self::Kills,
         Self::Simulation,
         Self::Players,
@@ -57,6 +59,7 @@ impl Sweep {
         Self::Updates,
         Self::Latch,
         Self::Stops,
+        Self::Skew,
         Self::Stories,
         Self::OldSites,
     ];
@@ -68,6 +71,7 @@ impl Sweep {
             Self::Players => 5_000,
             Self::Sockets => 1_000,
             Self::Stops => 100,
+            Self::Skew => 500,
             Self::Split | Self::Updates | Self::Latch | Self::OldSites => 1,
             Self::Stories => 2,
         }
@@ -76,7 +80,13 @@ impl Sweep {
     /// Whether what it does comes of seeds.
     const fn draws(self) -> bool {
         match self {
-            Self::Kills | Self::Simulation | Self::Players | Self::Sockets | Self::Stops | Self::Stories => true,
+            Self::Kills
+            | Self::Simulation
+            | Self::Players
+            | Self::Sockets
+            | Self::Stops
+            | Self::Skew
+            | Self::Stories => true,
             Self::Split | Self::Updates | Self::Latch | Self::OldSites => false,
         }
     }
@@ -89,6 +99,7 @@ impl Sweep {
             Self::Players => simulated(workspace, "played::many_seeds", from, seeds),
             Self::Sockets => over_sockets(workspace, from, seeds),
             Self::Stops => simulated(workspace, "stopped::in_cuts_and_kills", from, seeds),
+            Self::Skew => simulated(workspace, "skew::", from, seeds),
             Self::Split => split(workspace, seeds),
             Self::OldSites => counted(test(workspace, "e2e", "old_site::").env("MIDSHIFT_OLD_TASKS", OLD_TASKS)),
             Self::Updates => every_site(workspace, "agent", "power::"),
