@@ -84,7 +84,7 @@ impl Newer {
     fn state(&self) -> MutexGuard<'_, State> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
-    /// The server and the stop service are of this version from now on.
+    /// The server and the stop service are of that version from now on.
     pub fn server_is(&self, version: Version) {
         self.state().server = version;
     }
@@ -96,7 +96,7 @@ impl Newer {
     pub fn comes_with(&self, bundle: String) {
         self.state().bundle = Some(bundle);
     }
-    /// The next version is a bad one: its agents say a state that an agent must not say before nobody older listens.
+    /// The next version is a bad one: its agents say a state that nobody may say while somebody older listens.
     pub fn hastens(&self) {
         self.state().is_hasty = true;
     }
