@@ -51,12 +51,13 @@ enum Verb {
         #[arg(value_enum)]
         sweeps: Vec<sweep::Sweep>,
         /// How many seeds each, and how often split; unless told, 20 kills (about two minutes a seed), 2000 simulated shifts (about a quarter
-        /// of a second), 5000 drawn updates (about a tenth of a second), 100 runs of stops (some seconds), 2 stories (about ten minutes), and
+        /// of a second), 5000 drawn updates (about a tenth of a second), 100 runs of stops (some seconds), 500 shifts of each pair of versions, 2 stories
+        /// (about ten minutes), and
         /// split and night (about a quarter of an hour) once. Latch and old sites take none.
         #[arg(long)]
         seeds: Option<u64>,
-        /// The first seed of kills, simulation, updates, stops, stories and night; unless told, 1. Split and latch draw nothing and take none. A
-        /// failing seed alone: `torture kills|simulation|stops|stories|night --from SEED --seeds 1`; one of updates says its own command.
+        /// The first seed of kills, simulation, updates, stops, skew, stories and night; unless told, 1. Split and latch draw nothing and take none. A
+        /// failing seed alone: `torture kills|simulation|stops|skew|stories|night --from SEED --seeds 1`; one of updates says its own command.
         #[arg(long)]
         from: Option<u64>,
         /// What runs every night: whole stories and whole nights with four seeds each, and old sites.

@@ -40,6 +40,8 @@ pub enum Sweep {
     Latch,
     /// Robots at work in the deterministic simulation while stops are engaged and reset, lines to the stop service are cut, and everybody is killed.
     Stops,
+    /// Shifts with a roll-out and its way back in the deterministic simulation, of servers and agents that are one version apart.
+    Skew,
     /// Twenty robots, five of them launcher and agent processes, get a good release and three bad ones: about ten minutes a seed.
     Stories,
     /// Twelve robots under launchers at a server get a good release and three bad ones, with kills of everybody, a
@@ -63,6 +65,7 @@ impl Sweep {
         Self::Updates,
         Self::Latch,
         Self::Stops,
+        Self::Skew,
         Self::Stories,
         Self::Night,
         Self::OldSites,
@@ -75,6 +78,7 @@ impl Sweep {
             Self::Players | Self::Updates => 5_000,
             Self::Sockets => 1_000,
             Self::Stops => 100,
+            Self::Skew => 500,
             Self::Split | Self::Latch | Self::Night | Self::OldSites => 1,
             Self::Stories => 2,
         }
@@ -84,7 +88,7 @@ impl Sweep {
     const fn draws(self) -> bool {
         match self {
             Self::Kills | Self::Simulation | Self::Players | Self::Sockets => true,
-            Self::Updates | Self::Stops | Self::Stories | Self::Night => true,
+            Self::Updates | Self::Stops | Self::Skew | Self::Stories | Self::Night => true,
             Self::Split | Self::Latch | Self::OldSites => false,
         }
     }
@@ -98,6 +102,7 @@ impl Sweep {
             Self::Players => seeded(workspace, "simulation", "played::many_seeds", from, seeds),
             Self::Sockets => over_sockets(workspace, from, seeds),
             Self::Stops => seeded(workspace, "simulation", "stopped::in_cuts_and_kills", from, seeds),
+            Self::Skew => seeded(workspace, "simulation", "skew::", from, seeds),
             Self::Split => split(workspace, seeds),
             Self::OldSites => counted(test(workspace, "e2e", "old_site::").env("MIDSHIFT_OLD_TASKS", OLD_TASKS)),
             Self::Updates => {

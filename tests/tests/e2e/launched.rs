@@ -20,9 +20,12 @@ use midshift_core::ids::SiteId;
 use midshift_core::site::{DEMO, text};
 use midshift_core::time::Utc;
 use midshift_core::update::UpdateState;
+use midshift_durable::record as records;
 use midshift_proto::telemetry::v1::GetRobotRequest;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use midshift_sim::swarm::AGENT_FILE;
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{ConnectOptions, Connection, Row};
 use std::fs::File;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
@@ -30,6 +33,19 @@ use std::process::Command;
 
 /// Seconds without a pulse after which the launcher kills.
 const HANG_S: &str = "4";
+/// What an agent of the next version adds to a ledger; to each kind of row it does in robot_agent/tests/agent/successor.rs.
+const ADDED: &str = r#"
+CREATE TABLE mood (robot TEXT PRIMARY KEY, level INTEGER NOT NULL) STRICT;
+INSERT INTO mood VALUES ('rbt-01', 7);
+ALTER TABLE fact ADD COLUMN mood TEXT;
+ALTER TABLE lane ADD COLUMN mood TEXT;
+UPDATE fact SET value = json_set(value, '$.next_version', 7, '$.update.next_version', 7), mood = 'curious' WHERE key = 'software';
+INSERT INTO fact (key, value) VALUES ('mood', '{"level":7}');
+"#;
+/// What became of the update, and of what was added.
+const LEFT: &str =
+    "SELECT json_extract(value, '$.update.state') || ' ' || mood || ' ' || (SELECT level FROM mood) || ' ' ||
+    (SELECT value FROM fact WHERE key = 'mood') FROM fact WHERE key = 'software'";
 
 /// One robot's folder.
 struct Machine {
@@ -107,6 +123,19 @@ impl Machine {
         let row = SoftwareRow { update: Some(update), ..SoftwareRow::default() };
         Ok(store.commit(&[Op::Software(Box::new(row))]).await?)
     }
+    /// Adds what an agent of the next version might have: to the ledger, the switch record and the trust file.
+    async fn add_what_is_new(&self) -> anyhow::Result<()> {
+        let ledger = SqliteConnectOptions::new().filename(self.path("data").join(AGENT_FILE));
+        let mut ledger = ledger.connect().await?;
+        sqlx::raw_sql(ADDED).execute(&mut ledger).await?;
+        ledger.close().await?;
+        let switch = self.path("sets").join(midshift_agent::launcher::SWITCH);
+        let text = records::read(&switch)?.unwrap_or_default();
+        records::write(&switch, &format!("{text}mood curious\n"))?;
+        let mut trust: serde_json::Value = serde_json::from_slice(&std::fs::read(self.path("trust.json"))?)?;
+        trust["next_version"] = serde_json::json!({"level": 7});
+        Ok(std::fs::write(self.path("trust.json"), trust.to_string())?)
+    }
     /// The launcher with an agent that dials `server`; what the robot came with ends at once and well.
     fn launch(&self, server: &str, enrolment: Option<&str>) -> anyhow::Result<Launched> {
         self.launch_by("exec ", server, enrolment)
@@ -182,12 +211,46 @@ async fn a_launched_robot_says_the_version_of_the_set_it_runs() -> anyhow::Resul
     })?;
     let _launched =
         machine.launch(&server.address.to_string(), enrolment(server.address, "rbt-01").await?.as_deref())?;
+    assert_eq!(version_at(&server).await?, "1.5.0", "{}", text_of(&machine.log()));
+    Ok(())
+}
+
+/// The version that the robot says, once it says one.
+async fn version_at(server: &Server) -> anyhow::Result<String> {
     let version = until("the robot's version", LIMIT, || async {
         let mut client = TelemetryServiceClient::new(server.channel()?);
         let asked = client.get_robot(GetRobotRequest { robot_id: "rbt-01".to_owned() }).await;
         Ok(asked.ok().and_then(|robot| robot.into_inner().robot?.inventory).map(|inventory| inventory.software))
     });
-    assert_eq!(version.await?, "1.5.0", "{}", text_of(&machine.log()));
+    version.await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_robot_that_falls_from_the_next_version_goes_on_with_the_files_that_it_left() -> anyhow::Result<()> {
+    let machine = Machine::new()?;
+    let server_dir = tempfile::tempdir()?;
+    let server = Server::start(server_dir.path()).await?;
+    let kept = machine.stage("1.5.0", "speed_permille = 900\n")?;
+    let next = machine.stage("1.6.0", "crash_on_start = true\n")?;
+    machine.switch(|switch| {
+        switch.try_out(&kept.id().to_string());
+        switch.commit();
+        switch.try_out(&next.id().to_string());
+    })?;
+    machine.remember_probation(&next).await?;
+    machine.add_what_is_new().await?;
+    let _launched =
+        machine.launch(&server.address.to_string(), enrolment(server.address, "rbt-01").await?.as_deref())?;
+    assert_eq!(version_at(&server).await?, "1.5.0", "{}", text_of(&machine.log()));
+    let left = until("the ledger to say that it went back", LIMIT, || async {
+        let mut ledger = SqliteConnectOptions::new().filename(machine.path("data").join(AGENT_FILE)).connect().await?;
+        let left: Option<String> = sqlx::query(LEFT).fetch_one(&mut ledger).await?.try_get(0)?;
+        ledger.close().await?;
+        Ok(left.filter(|left| left.starts_with("rolled_back")))
+    });
+    assert_eq!(left.await?, "rolled_back curious 7 {\"level\":7}", "{}", text_of(&machine.log()));
+    let switch = record(&machine)?;
+    assert_eq!((switch.running(), switch.trial.as_ref()), (kept.id().to_string().as_str(), None));
     Ok(())
 }
 

@@ -6,6 +6,7 @@ use crate::body::WatchedBody;
 use crate::clock::{MachineClock, Skew, TrueTime};
 use crate::disk::RobotDisk;
 use crate::net::{Ear, SERVER, SimDial, Wire};
+use crate::newer::{Newer, Voice};
 use crate::observer::Shared;
 use crate::stops;
 use crate::worker::SlowWorker;
@@ -55,6 +56,8 @@ pub struct Agent {
     pub trust: Trust,
     /// Naive rules.
     pub bugs: Bugs,
+    /// Which of its programs are of the next version; none: nobody asks.
+    pub newer: Option<Newer>,
     /// Processes so far.
     pub lives: Arc<AtomicU64>,
 }
@@ -116,11 +119,12 @@ impl Agent {
 
     async fn run(&self, life: u64, hangs_after: Option<Duration>) -> anyhow::Result<Ended> {
         let (robot_id, number) = (self.body.robot_id().clone(), self.number(life));
-        let bulk = Bulk::new(Arc::new(self.dial()));
+        let voice = self.voice()?;
+        let bulk = Bulk::new(Arc::new(self.dial(voice.clone())));
         let updates = self.launched.updates(&self.trust, bulk.clone())?;
         let worker = SlowWorker::new(updates.worker, self.launched.clone(), &robot_id, &self.observer, number);
         let config = AgentConfig {
-            stop: self.stop.as_ref().map(|line| line.dial(machine(self.robot))),
+            stop: self.stop.as_ref().map(|line| line.dial(machine(self.robot), voice.clone())),
             update: Some(Updates { worker: Box::new(worker), ..updates }),
             robot_id: robot_id.clone(),
             boot_id: format!("boot-{}-{life}", self.robot),
@@ -133,7 +137,7 @@ impl Agent {
         let disk = RobotDisk::open(self.memory.clone(), robot_id.clone(), self.observer.clone(), number);
         let clock: Arc<dyn Clock> = MachineClock::boot(&self.time, self.skew);
         let never = CancellationToken::new();
-        let lines = Lines { link: Arc::new(self.dial()), bulk };
+        let lines = Lines { link: Arc::new(self.dial(voice)), bulk };
         let agent = session::run(config, Box::new(witness), Box::new(disk), clock, lines, never);
         tokio::pin!(agent);
         let hang = async {
@@ -158,7 +162,15 @@ impl Agent {
         Ok(Ended::Killed)
     }
 
-    fn dial(&self) -> SimDial {
-        SimDial { to: SERVER, ear: self.ear.clone(), machine: machine(self.robot), wire: self.wire.clone() }
+    /// Of the program that runs now.
+    fn voice(&self) -> anyhow::Result<Option<Voice>> {
+        let Some(newer) = &self.newer else { return Ok(None) };
+        let holdings = self.launched.holdings()?;
+        let bundle = holdings.set(holdings.switch.running()).and_then(|set| set.bundle);
+        Ok(Some(newer.voice(self.robot, bundle.map(|bundle| bundle.to_string()))))
+    }
+
+    fn dial(&self, voice: Option<Voice>) -> SimDial {
+        SimDial { to: SERVER, ear: self.ear.clone(), machine: machine(self.robot), wire: self.wire.clone(), voice }
     }
 }

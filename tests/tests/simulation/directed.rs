@@ -33,6 +33,7 @@ pub fn config(seed: u64, robots: usize, naive: Naive) -> RoomConfig {
         stops: false,
         site: DEMO.to_owned(),
         players: Vec::new(),
+        newer: None,
     }
 }
 

@@ -2,6 +2,7 @@
 //!
 //! Invariant: what was acknowledged is there after a crash; what was not may be there or not.
 
+use crate::newer::Newer;
 use crate::observer::Shared;
 use midshift_agent::memory::MemoryStore as RobotMemory;
 use midshift_agent::store::{Error as RobotError, Kept, Op, Store as RobotStore};
@@ -47,6 +48,7 @@ struct State {
 pub struct ServerDisk {
     inner: Arc<MemoryStore>,
     observer: Shared,
+    newer: Option<Newer>,
     state: Mutex<State>,
 }
 
@@ -55,10 +57,11 @@ fn cause(text: &'static str) -> Cause {
 }
 
 impl ServerDisk {
-    /// A healthy disk over `inner`, watched by `observer`.
-    pub fn new(inner: Arc<MemoryStore>, observer: Shared, seed: u64) -> Self {
+    /// A healthy disk over `inner`, watched by `observer`; `newer` says which version of the server writes.
+    pub fn new(inner: Arc<MemoryStore>, observer: Shared, seed: u64, newer: Option<Newer>) -> Self {
         let rng = StdRng::seed_from_u64(seed ^ 0x6469_736b);
-        Self { inner, observer, state: Mutex::new(State { mood: Mood::GOOD, rng, unknown: 0, refused: 0, slow: 0 }) }
+        let state = Mutex::new(State { mood: Mood::GOOD, rng, unknown: 0, refused: 0, slow: 0 });
+        Self { inner, observer, newer, state }
     }
     fn state(&self) -> std::sync::MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
@@ -121,6 +124,10 @@ impl Store for ServerDisk {
         if unknown && !applies {
             return unheard();
         }
+        let items = match &self.newer {
+            Some(newer) => newer.writes(items),
+            None => items,
+        };
         let results = self.inner.commit(items).await;
         self.observer.committed();
         tokio::time::sleep(Duration::from_millis(after)).await;

@@ -9,7 +9,7 @@ use midshift_core::reason::Code;
 use midshift_core::rows::{Record, Row, Table};
 use midshift_core::task::Attempt;
 use midshift_store::{MemoryStore, Store};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// What only a person can solve has an incident.
 pub const ASKED: &str = "what a person must solve has an incident";
@@ -73,6 +73,11 @@ fn are_few(rows: &[Row], seen: &mut Observer) {
         let holds = many <= limits::INCIDENTS_OF_ROBOT_MAX;
         seen.check(BOUNDED, holds, || format!("{many} incidents {code} of {robot_id}"));
     }
+}
+
+/// Codes of all incidents, open and closed.
+pub fn codes(store: &MemoryStore) -> BTreeSet<Code> {
+    all::<Incident>(&rows(store)).map(|incident| incident.reason.code).collect()
 }
 
 fn are_open(rows: &[Row], seen: &mut Observer) {

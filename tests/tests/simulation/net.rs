@@ -1,5 +1,6 @@
 //! Connections over the simulated network, for tonic at both ends, and what was written on them while their way was broken.
 
+use crate::newer::Voice;
 use hyper_util::rt::TokioIo;
 use midshift_agent::dial::{self, Dial};
 use std::collections::BTreeMap;
@@ -207,6 +208,8 @@ pub struct SimDial {
     pub machine: String,
     /// Who counts what is lost.
     pub wire: Wire,
+    /// What its program says and hears more than this version does; none: nothing stands between it and who it dials.
+    pub voice: Option<Voice>,
 }
 
 #[async_trait::async_trait]
@@ -220,7 +223,12 @@ impl Dial for SimDial {
                 Ok::<_, io::Error>(TokioIo::new(Heard { stream, ear, machine, wire }))
             }
         };
-        let connected = dial::endpoint(&uri(to))?.connect_with_connector(tower::service_fn(connect)).await;
+        let endpoint = dial::endpoint(&uri(to))?;
+        let connected = endpoint.connect_with_connector(tower::service_fn(connect)).await;
+        let connected = match (&self.voice, connected) {
+            (Some(voice), Ok(server)) => voice.over(&endpoint, server).await,
+            (_, connected) => connected,
+        };
         connected.map_err(|error| dial::Error(error.into()))
     }
 }

@@ -121,6 +121,7 @@ impl Game {
             stops: false,
             site: DEMO.to_owned(),
             players: players.clone(),
+            newer: None,
         };
         let room = Room::open(&config)?;
         let robot_ids = players.iter().map(|p| p.lock().unwrap_or_else(PoisonError::into_inner).robot_id().clone());

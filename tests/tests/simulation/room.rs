@@ -8,6 +8,7 @@ use crate::client;
 use crate::clock::{MachineClock, Skew, TrueTime};
 use crate::disk::{ServerDisk, ServerFrames};
 use crate::net::{self, Ear, SERVER, SimDial, Wire};
+use crate::newer::Newer;
 use crate::observer::Shared;
 use crate::software::Software;
 use crate::stops::Stops;
@@ -81,6 +82,8 @@ pub struct RoomConfig {
     pub site: String,
     /// Robots without a body that behave badly.
     pub players: Vec<Arc<Mutex<Player>>>,
+    /// Which programs are of the next version; none: nobody asks.
+    pub newer: Option<Newer>,
 }
 
 /// The room.
@@ -133,7 +136,7 @@ impl Room {
         let store_id = StoreId(Arc::from(format!("store-{}", config.seed)));
         let store = Arc::new(MemoryStore::new(site.site_id().clone(), store_id, clock.clone()));
         let observer = Shared::new(time.clone(), store.clone());
-        let disk = Arc::new(ServerDisk::new(store.clone(), observer.clone(), config.seed));
+        let disk = Arc::new(ServerDisk::new(store.clone(), observer.clone(), config.seed, config.newer.clone()));
         let frames = MemoryFrames::new(clock.clone(), FRAME_BYTES_DEFAULT);
         let frames: Arc<dyn FrameLog> = Arc::new(ServerFrames::new(frames, disk.clone()));
         let of_hall = HallConfig { faults: config.faults, ..HallConfig::new(site.clone(), config.robots, config.seed) };
@@ -163,6 +166,7 @@ impl Room {
                 launched: launched[robot].clone(),
                 trust: software.trust.clone(),
                 bugs: config.naive.agent,
+                newer: config.newer.clone(),
                 lives: Arc::default(),
             };
             run_agent(&mut sim, agent);
@@ -375,7 +379,8 @@ pub fn player_machine(number: usize) -> String {
 fn play(sim: &mut turmoil::Sim<'static>, number: usize, player: &Arc<Mutex<Player>>, time: &TrueTime, wire: &Wire) {
     let (player, time, wire) = (player.clone(), time.clone(), wire.clone());
     sim.host(player_machine(number), move || {
-        let dial = SimDial { to: SERVER, ear: Ear::default(), machine: player_machine(number), wire: wire.clone() };
+        let (machine, wire) = (player_machine(number), wire.clone());
+        let dial = SimDial { to: SERVER, ear: Ear::default(), machine, wire, voice: None };
         let line = Line::new(player.clone(), Arc::new(dial), MachineClock::boot(&time, Skew::default()));
         async move {
             line.play().await;

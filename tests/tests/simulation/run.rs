@@ -99,6 +99,7 @@ impl Shift {
             stops: false,
             site: DEMO.to_owned(),
             players: Vec::new(),
+            newer: None,
         };
         Ok(Self {
             room: Room::open(&config)?,

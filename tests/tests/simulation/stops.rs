@@ -5,6 +5,7 @@
 use crate::agent::machine;
 use crate::clock::{MachineClock, Skew, TrueTime};
 use crate::net::{self, Ear, STOPS, SimDial, Way, Wire};
+use crate::newer::Voice;
 use midshift_agent::stop::keep::MemoryStops;
 use midshift_agent::stop::line::StopLine;
 use midshift_core::identity::Caller;
@@ -35,8 +36,8 @@ pub struct RobotLine {
 
 impl RobotLine {
     /// For one process of the robot.
-    pub fn dial(&self, machine: String) -> StopLine {
-        let dial = SimDial { to: STOPS, ear: Ear::default(), machine, wire: self.wire.clone() };
+    pub fn dial(&self, machine: String, voice: Option<Voice>) -> StopLine {
+        let dial = SimDial { to: STOPS, ear: Ear::default(), machine, wire: self.wire.clone(), voice };
         StopLine { dial: Arc::new(dial), keep: Box::new(self.kept.clone()) }
     }
 }
