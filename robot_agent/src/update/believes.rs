@@ -3,7 +3,7 @@
 //! Invariant: what the repository says is written down before a directive is held against it; a new key counts only by the rule of
 //! [`midshift_bundle::key_set`]. Called by the machine.
 
-use super::{HeldKeys, Job, SoftwareRow, Update};
+use super::{Done, HeldKeys, Job, SoftwareRow, Update};
 use crate::core::AgentCore;
 use crate::store::Op;
 use midshift_bundle::bugs::Bugs;
@@ -111,6 +111,18 @@ impl AgentCore {
                 self.ask_to_refresh(now, trusted, clock);
             }
             Err(reason) => self.move_to(UpdateState::Refused, Some(reason)),
+        }
+    }
+
+    /// Writes down what is believed of a refresh that failed, a newer root first of all. The time floor may have risen meanwhile.
+    pub(super) fn believe_what_came(&mut self, done: Done) -> Done {
+        match done {
+            Done::Believed { trusted, failure } => {
+                let floor = self.kept.ledger.trusted.as_ref().map_or(Utc(0), |known| known.time_floor());
+                self.write(Op::Trusted(Arc::new(trusted.at_least(floor))), true);
+                Done::Failed(failure)
+            }
+            done => done,
         }
     }
 

@@ -179,14 +179,24 @@ impl UpdateWorker {
     }
 
     async fn refresh(&self, trusted: &Trusted, clock: Reading, keys_after: u64) -> Done {
-        match trusted.refresh(Arc::new(Metadata(self.remote.clone())), clock).await {
+        let failed = match trusted.refresh_or_root(Arc::new(Metadata(self.remote.clone())), clock).await {
             Ok(refreshed) => match self.key_sets(&refreshed, keys_after).await {
-                Ok(key_sets) => Done::Refreshed { refreshed: Box::new(refreshed), key_sets },
-                Err(error) => later(error),
+                Ok(key_sets) => return Done::Refreshed { refreshed: Box::new(refreshed), key_sets },
+                Err(error) => {
+                    let (trusted, failure) = (Box::new(refreshed.trusted), Failure::Later(error.to_string()));
+                    return Done::Believed { trusted, failure };
+                }
             },
-            Err(error) if error.is_unreachable() => later(error),
-            Err(error @ trust::Error::Store { .. }) => later(error),
-            Err(error) => refused(Reason::new(Code::MetadataRefused, error.to_string())),
+            Err(failed) => failed,
+        };
+        let failure = match failed.error {
+            error if error.is_unreachable() => Failure::Later(error.to_string()),
+            error @ trust::Error::Store { .. } => Failure::Later(error.to_string()),
+            error => Failure::Refused(Reason::new(Code::MetadataRefused, error.to_string())),
+        };
+        match failed.rooted {
+            Some(trusted) => Done::Believed { trusted, failure },
+            None => Done::Failed(failure),
         }
     }
 

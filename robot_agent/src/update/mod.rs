@@ -204,6 +204,13 @@ pub enum Done {
         /// Envelopes of newer sets of directive keys, by the number under which they are listed.
         key_sets: BTreeMap<u64, Vec<u8>>,
     },
+    /// The repository gave something to be believed, and not what was asked for.
+    Believed {
+        /// What is believed now.
+        trusted: Box<Trusted>,
+        /// Why not the rest.
+        failure: Failure,
+    },
     /// A manifest.
     Manifest(Box<Manifest>),
     /// Done as asked.

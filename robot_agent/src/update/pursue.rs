@@ -117,6 +117,7 @@ impl AgentCore {
     /// Takes what came of the job under way.
     pub(crate) fn job_done(&mut self, now: &Now, done: Done) {
         let Some(job) = self.update.running.take() else { return };
+        let done = self.believe_what_came(done);
         if std::mem::take(&mut self.update.drops) && matches!(job, Job::Fetch { .. }) && !matches!(done, Done::Ok) {
             return;
         }
