@@ -27,11 +27,6 @@ pub const RANGE_BYTES: u64 = 4 * 1024 * 1024;
 /// What came is made durable this often, if it does not become so by its amount.
 const SYNC_EVERY: Duration = Duration::from_secs(2);
 
-/// A shorter way that is not made within this is not waited for.
-const WAY_WITHIN: Duration = Duration::from_secs(600);
-/// Nobody is asked more often.
-const ASK_AGAIN_MIN: Duration = Duration::from_millis(500);
-
 /// Bytes of one range, in order, in pieces of any length.
 pub type Pieces = std::pin::Pin<Box<dyn tokio_stream::Stream<Item = io::Result<Vec<u8>>> + Send>>;
 
@@ -60,8 +55,6 @@ pub enum Way {
         /// What is fetched.
         encoded: Wanted,
     },
-    /// A shorter way is being made: ask again after this.
-    AskAgain(Duration),
 }
 
 /// Does jobs.
@@ -270,13 +263,13 @@ impl UpdateWorker {
         pace: &mut Pace,
         leave: &CancellationToken,
     ) -> Result<bool, Stop> {
-        let Some((base, encoded)) = self.shorter(wanted, bases, leave).await? else { return Ok(false) };
+        let Some((base, encoded)) = self.shorter(wanted, bases).await? else { return Ok(false) };
         let failed = match self.fetch_whole(encoded, pace, leave).await {
             Ok(()) => match self.on_disk(move |sets| sets.decode(&wanted, base.as_ref(), &encoded)).await {
                 Ok(()) => return Ok(true),
                 Err(error) => error.to_string(),
             },
-            // The server needed its room: it may be made again one day, and the file comes as it is now.
+            // It was withdrawn meanwhile: the file comes as it is.
             Err(Stop::Gone(_)) => return Ok(false),
             Err(Stop::Failed(Failure::Refused(reason))) => reason.text().to_owned(),
             Err(later) => return Err(later),
@@ -286,31 +279,14 @@ impl UpdateWorker {
         Ok(false)
     }
 
-    /// A shorter way that the server names and that can lead there. While one is made it is waited for, up to [`WAY_WITHIN`].
-    async fn shorter(
-        &self,
-        wanted: Wanted,
-        bases: &[Digest],
-        leave: &CancellationToken,
-    ) -> Result<Option<(Option<Digest>, Wanted)>, Stop> {
-        let begun = Instant::now();
-        loop {
-            match self.remote.way(&wanted, bases).await.map_err(unreached)? {
-                Way::AsItIs => return Ok(None),
-                Way::Shorter { base, encoded } => {
-                    let is_one =
-                        encoded.length > 0 && encoded.length < wanted.length && encoded.digest != wanted.digest;
-                    let has_base = base.is_none_or(|base| bases.contains(&base));
-                    return Ok((is_one && has_base).then_some((base, encoded)));
-                }
-                Way::AskAgain(after) if begun.elapsed() < WAY_WITHIN => tokio::select! {
-                    biased;
-                    () = leave.cancelled() => return Err(unreached("left")),
-                    () = tokio::time::sleep(after.clamp(ASK_AGAIN_MIN, WAY_WITHIN)) => {}
-                },
-                Way::AskAgain(_) => return Ok(None),
-            }
-        }
+    /// A shorter way that the server names and that can lead there.
+    async fn shorter(&self, wanted: Wanted, bases: &[Digest]) -> Result<Option<(Option<Digest>, Wanted)>, Stop> {
+        let Way::Shorter { base, encoded } = self.remote.way(&wanted, bases).await.map_err(unreached)? else {
+            return Ok(None);
+        };
+        let is_one = encoded.length > 0 && encoded.length < wanted.length && encoded.digest != wanted.digest;
+        let has_base = base.is_none_or(|base| bases.contains(&base));
+        Ok((is_one && has_base).then_some((base, encoded)))
     }
 
     /// Fetches what is missing and checks the whole.

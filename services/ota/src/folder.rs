@@ -26,6 +26,8 @@ const IN_USE: &str = "in-use.lock";
 pub const CONTENT: &str = "content.lock";
 /// Locked by whoever changes documents, or must not have them changed.
 pub const METADATA: &str = "metadata.lock";
+/// Shorter ways that a server before 0.2.0 made.
+const ENCODED: &str = "encoded";
 /// What a new file system has by itself.
 const LOST_AND_FOUND: &str = "lost+found";
 /// Between two looks at a lock that another process holds.
@@ -134,6 +136,19 @@ pub fn must_be_of(folder: &Path, expected: &StoreId) -> Result<(), Error> {
         return Ok(());
     }
     Err(Error::NoMarker { folder: folder.to_owned(), expected: expected.clone() })
+}
+
+/// Takes away what servers once made of files and nobody reads any more: who signs a release makes its shorter ways. Blocks.
+pub fn remove_encoded(folder: &Path) {
+    let encoded = folder.join(ENCODED);
+    match fs::remove_dir_all(&encoded) {
+        Ok(()) => {
+            tracing::info!(path = %encoded.display(), "shorter ways that an older server had made were taken away")
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+        // It takes room, and is in nobody's way.
+        Err(error) => tracing::warn!(path = %encoded.display(), %error, "a folder that nobody reads any more stays"),
+    }
 }
 
 fn is_empty(folder: &Path) -> Result<bool, Disk> {

@@ -62,6 +62,22 @@ async fn several_begin_an_empty_folder_only_if_their_store_knows_no_bundle() {
 }
 
 #[tokio::test]
+async fn what_older_servers_made_of_files_is_taken_away_at_the_start_and_nothing_else_is() {
+    let dir = TempDir::new().expect("a folder");
+    let folder = dir.path().join("ota");
+    for path in ["encoded/ab", "content"] {
+        fs::create_dir_all(folder.join(path)).expect("made");
+    }
+    fs::write(folder.join("encoded/ab/patch"), "bytes").expect("written");
+    fs::write(folder.join("kept"), "by somebody").expect("written");
+    for _ in 0..2 {
+        drop(crate::fixture::service(&dir).await);
+        let is_there = ["encoded", "content", "kept"].map(|name| folder.join(name).exists());
+        assert_eq!(is_there, [false, true, true]);
+    }
+}
+
+#[tokio::test]
 async fn what_is_not_there_is_not_made_by_who_reads() {
     let dir = TempDir::new().expect("a folder");
     let folder = dir.path().join("volume");
