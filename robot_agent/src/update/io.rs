@@ -57,6 +57,11 @@ pub enum Way {
     },
 }
 
+/// Whether a file of so many bytes may come by a shorter way; others come as they are.
+pub(super) fn may_come_encoded(length: u64) -> bool {
+    (ENCODED_BYTES_MIN..=ENCODED_BYTES_MAX).contains(&length)
+}
+
 /// Does jobs.
 #[async_trait]
 pub trait Worker: Send {
@@ -248,8 +253,8 @@ impl UpdateWorker {
         let missing = self.on_disk(move |sets| sets.missing(&wanted)).await.map_err(stopped)?;
         let begun = missing.iter().map(|range| range.end - range.start).sum::<u64>() < wanted.length;
         let noted = self.on_disk(move |sets| sets.is_fetched_as_it_is(&wanted)).await.map_err(stopped)?;
-        let worth = (ENCODED_BYTES_MIN..=ENCODED_BYTES_MAX).contains(&wanted.length);
-        if worth && !begun && !noted && self.fetch_shorter(wanted, bases, pace, leave).await? {
+        if may_come_encoded(wanted.length) && !begun && !noted && self.fetch_shorter(wanted, bases, pace, leave).await?
+        {
             return Ok(());
         }
         self.fetch_whole(wanted, pace, leave).await

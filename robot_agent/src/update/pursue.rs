@@ -3,7 +3,7 @@
 //! Invariant: level-triggered. It may be called at any moment and any number of times; what it decides is written down before it is done.
 
 use super::believes::refusal_of;
-use super::{Done, Failure, Job, SoftwareRow, Update, again, migrate};
+use super::{Done, Failure, Job, SoftwareRow, Update, again, io, migrate};
 use crate::core::{AgentCore, ExitReason, Output};
 use crate::sets::{Holdings, Wanted};
 use crate::store::Op;
@@ -423,7 +423,9 @@ impl AgentCore {
             return self.move_to(UpdateState::Refused, Some(reason));
         }
         let base = set.base().filter(|_| set.changes_base(&current)).map_or(0, |base| base.length);
-        let needed: u64 = manifest.components.iter().map(|c| c.length).sum::<u64>() + base;
+        // A file that comes encoded is there until its component is made of it.
+        let encoded = manifest.components.iter().map(|c| c.length).filter(|length| io::may_come_encoded(*length)).max();
+        let needed = manifest.components.iter().map(|c| c.length).sum::<u64>() + encoded.unwrap_or(0) + base;
         if needed > holdings.free_bytes {
             let reason =
                 Reason::from(Code::NoRoom).with("needed_bytes", needed).with("free_bytes", holdings.free_bytes);
