@@ -148,6 +148,7 @@ impl AgentCore {
             return;
         }
         match self.open(&desired, time) {
+            Ok(_) if self.goes_back_first(&desired) => {}
             Ok(directive) => {
                 self.update.judged = Some(desired.directive.clone());
                 self.update.fetched.clear();
@@ -170,6 +171,23 @@ impl AgentCore {
             }
             Err(reason) => self.refuse_directive(reason),
         }
+    }
+
+    /// A newer order has come to a robot that is stuck with a set on trial: its kept set is read again and gone back to, and the order is looked
+    /// at after that. One that is stuck still does not take it.
+    fn goes_back_first(&mut self, desired: &DesiredUpdate) -> bool {
+        let on_trial = self.update.holdings.as_ref().is_some_and(|holdings| holdings.switch.trial.is_some());
+        let stuck = self.kept.ledger.software.update.clone().filter(|u| on_trial && u.state == UpdateState::Stuck);
+        let Some(update) = stuck else { return false };
+        if self.update.back_first.as_ref() == Some(&desired.directive) {
+            self.refuse_directive(update.reason.unwrap_or_else(|| Code::KeptSetBad.into()));
+            return true;
+        }
+        self.update.back_first = Some(desired.directive.clone());
+        let (state, reason) = (UpdateState::RollingBack, Some(Reason::from(Code::RevertAsked)));
+        let drain_id = desired.drain_id.clone().or(update.drain_id.clone());
+        self.put_update(Update { state, drain_id, reason, ..update });
+        true
     }
 
     fn open(&self, desired: &DesiredUpdate, now: Utc) -> Result<Directive, Reason> {

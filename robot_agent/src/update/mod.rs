@@ -257,6 +257,8 @@ pub(crate) struct Updater {
     pub(crate) floor: Option<(Utc, LinkTime)>,
     /// Generation of the section whose order to go back was refused because nothing is kept.
     pub(crate) no_way_back: Option<u64>,
+    /// Envelope of a newer order for which a stuck robot has tried to go back.
+    pub(crate) back_first: Option<String>,
     /// Content that is known to be there.
     pub(crate) fetched: BTreeSet<Digest>,
     /// Bytes that are there and those that are needed.

@@ -331,9 +331,9 @@ impl AgentCore {
             self.put_update(Update { state, drain_id, reason, ..update });
             return true;
         }
-        let set = holdings.set(&holdings.switch.current).filter(|set| set.bundle == Some(directive.manifest));
-        let Some(set) = set else {
-            self.refuse_directive(Reason::new(Code::DirectiveRefused, "another bundle is the committed one"));
+        let committed = holdings.set(&holdings.switch.current).filter(|_| holdings.switch.trial.is_none());
+        let Some(set) = committed.filter(|set| set.bundle == Some(directive.manifest)) else {
+            self.refuse_directive(Reason::new(Code::DirectiveRefused, "another bundle is the committed one, or runs"));
             return false;
         };
         let row = software.with(&directive, &desired);

@@ -30,6 +30,7 @@ mod stops;
 mod stops_beside;
 #[path = "../../../tests/src/strace.rs"]
 mod strace;
+mod stuck;
 mod successor;
 mod told_time;
 mod trusts;
