@@ -1,11 +1,12 @@
 //! The robot's updater without IO: which bytes to fetch, when to switch, when to go back.
 //!
 //! Rooms: here what it knows and asks for; `pursue` is the machine; `believes` is what it holds directives against; `migrate` is what follows a commit; `io` does the jobs; `remote` asks the server;
-//! `again` says how long is waited for what failed. Called by the core.
+//! `again` says how long is waited for what failed; `behind` mends a switch record that is older than the ledger. Called by the core.
 //! Invariant: each side effect is a [`Job`], and a job begins only after the ledger row that explains it is durable; at most one job is
-//! under way. The switch record wins over the ledger.
+//! under way. The switch record wins over the ledger, unless it has on trial what the ledger has committed.
 
 mod again;
+mod behind;
 mod believes;
 pub mod io;
 pub mod migrate;

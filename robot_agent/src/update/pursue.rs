@@ -234,12 +234,7 @@ impl AgentCore {
     fn without_update(&mut self, now: &Now, holdings: &Holdings) -> Option<ExitReason> {
         let update = self.kept.ledger.software.update.as_ref();
         let is_stuck = update.is_some_and(|u| u.state == UpdateState::Stuck);
-        if holdings.switch.trial.is_some() && !is_stuck {
-            // The ledger knows of no trial: the set that was committed is gone back to.
-            let mut switch = holdings.switch.clone();
-            switch.go_back();
-            self.update.went_back = true;
-            self.ask_for(Job::Write(switch));
+        if !is_stuck && self.end_unknown_trial(&holdings.switch) {
             return None;
         }
         if self.update.went_back {
@@ -633,6 +628,7 @@ impl AgentCore {
             return self.put_update(Update { state, tries, reason: Some(reason), ..update });
         }
         match update.state {
+            UpdateState::Committed if fallen.is_some() => self.has_fallen(update, fallen.map_or(0, |f| f.tries)),
             UpdateState::Switching if runs => self.move_to(UpdateState::Probation, None),
             // The power went before the record was written: the grant was not used.
             UpdateState::Switching => self.move_to(UpdateState::Staged, None),
@@ -729,7 +725,7 @@ impl AgentCore {
         wanted && !(update.state == UpdateState::Committed && update.is_irreversible)
     }
 
-    fn go_back(&mut self, update: Update, reason: Reason) {
+    pub(super) fn go_back(&mut self, update: Update, reason: Reason) {
         if update.state == UpdateState::Committed && !self.kept.ledger.software.due.is_empty() {
             self.put_software(SoftwareRow { due: Vec::new(), ..self.kept.ledger.software.clone() });
         }
