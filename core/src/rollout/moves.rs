@@ -42,8 +42,9 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             step(tx, r, Step::Skipped, "robot.skipped");
         }
         Move::Again => {
-            // If no wave was judged the waves begin anew, and each robot keeps its own.
-            r.wave = if rollout.wave < rollout.spec.waves.len() as u32 { r.wave } else { rollout.wave };
+            // If no wave was judged the waves begin anew, and each robot keeps its own. Nobody comes into one that was judged.
+            let is_last = rollout.wave >= rollout.spec.waves.len() as u32;
+            r.wave = if is_last { rollout.wave } else { r.wave.max(rollout.wave) };
             (r.again, r.why, r.ready) = (true, None, false);
             step(tx, r, Step::Waiting, "robot.tried_again");
         }

@@ -6,7 +6,7 @@
 
 use super::hear::{is_hard, is_old, report_of};
 use super::rows::{Given, Pause, Phase, Rollout, RolloutRobot, Step};
-use super::turns::{is_late, is_newcomer, is_on, is_retried};
+use super::turns::{is_late, is_newcomer, is_on, is_retried, waits_out};
 use super::view::View;
 use super::{Board, infrastructure, jams, matching, served, verdict};
 use crate::authority::Authority;
@@ -94,7 +94,7 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
         Step::Committing => committing(view, rollout, r, report),
         Step::Reverting => reverting(view, board, now, rollout, r, report),
         Step::Committed => goes_back(view, rollout, r).then_some(Move::Revert),
-        Step::Skipped if is_tried_again(rollout, r) => Some(Move::Again),
+        Step::Skipped if is_tried_again(now, rollout, r) => Some(Move::Again),
         Step::Skipped => keeps_for_nothing(view, rollout, r).then_some(Move::Forget),
         Step::RolledBack => None,
         // Somebody mended it.
@@ -107,8 +107,10 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
     due.or_else(|| (is_out && is_long()).then_some(Move::Lost))
 }
 
-fn is_tried_again(rollout: &Rollout, r: &RolloutRobot) -> bool {
-    rollout.second_pass && rollout.phase == Phase::Applying && !r.again && is_retried(r)
+fn is_tried_again(now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    let waited = waits_out(r).is_some_and(|wait_ms| now.ms_since(r.since) >= wait_ms);
+    let at_the_end = rollout.second_pass && !r.again && is_retried(r);
+    rollout.phase == Phase::Applying && (waited || at_the_end)
 }
 
 /// It has the bundle for a second try that will not come.
