@@ -130,6 +130,17 @@ async fn the_first_mends_before_others_come_and_each_has_a_number_of_its_own() {
     assert!(third.number > 2);
 }
 
+#[test]
+fn a_number_is_drawn_once_whatever_the_file_held_before() {
+    let dir = TempDir::new().expect("a folder");
+    let path = dir.path().join("in-use.lock");
+    for (before, drawn) in [("", 1), ("9", 10), ("99\n", 100), ("what nobody wrote, and longer than a number", 1)] {
+        fs::write(&path, before).expect("written");
+        let numbers = [(); 3].map(|()| super::next_number(&path).expect("drawn"));
+        assert_eq!(numbers, [drawn, drawn + 1, drawn + 2], "{before:?}");
+    }
+}
+
 #[tokio::test]
 async fn the_lock_of_a_process_that_is_killed_is_free() {
     let dir = TempDir::new().expect("a folder");
