@@ -1,7 +1,8 @@
 //! A process that does not lead: it keeps its picture by rows alone, answers from it, and carries out what people ask.
 //!
-//! Invariant: it decides nothing but commands, tells nothing but that a file which it was to hand out is damaged, and signs nothing. A command is decided on the picture, committed on the condition that nothing of it
-//! has changed, and decided anew if something has; the process that leads obeys what is written.
+//! Invariant: it decides nothing but commands, tells nothing but that a file which it was to hand out is damaged, and signs nothing. A command is
+//! decided on the picture, committed on the condition that nothing of it has changed, and decided anew if something has; the process that leads
+//! obeys what is written.
 
 use super::Request;
 use super::reconcile::Loop;
