@@ -357,7 +357,7 @@ codes! {
     BundleUnfit = "BUNDLE_UNFIT", "The bundle does not fit the robot: hardware, floor, what it needs or what it excludes.";
     BundleCorrupt = "BUNDLE_CORRUPT", "What was downloaded is not what was signed.";
     NoRoom = "NO_ROOM", "The robot has too little room on its disk for one more set.";
-    BaseTooSoon = "BASE_TOO_SOON", "A new base takes the slot of the set before, which can then not be gone back to: the running set must have been kept for 24 hours first. Order it again later.";
+    BaseTooSoon = "BASE_TOO_SOON", "A new base takes the slot of the set before, which can then not be gone back to: the running set must have been kept for 24 hours first. A roll-out that still fills waves asks it again by itself; else order it again later.";
     MigrationDue = "MIGRATION_DUE", "The set is kept; its program still has to bring the robot's data to the new version.";
     MigrationFailed = "MIGRATION_FAILED", "The set is kept, but its program could not bring the robot's data to the new version. It is called again; look into the robot's log, or send a newer bundle.";
     ActivationBlocked = "ACTIVATION_BLOCKED", "The robot waits with its new software: it has work, a load, a stop, is in a passage, too hot or too low on charge.";

@@ -3,11 +3,12 @@
 //! `tough` checks signatures and the chain; its disk, clock and downloads are not used. What was believed goes in as one value and comes
 //! out as one value, so that it is on the disk whole or not at all.
 //! Invariant: versions never go back unless a new root has changed the keys of that role; expiry is judged by a time floor that never falls. It rises with
-//! signed times and with what a proven server tells, each signed document at most two days past what the robot knows of the time by itself.
+//! signed times and with what a proven server tells, each signed document at most two days past what the robot knows of the time by itself. A new root that
+//! was signed as the one before asks is believed though what comes after it in the same refresh is not.
 
 use crate::bugs::Bugs;
 use crate::digest::Digest;
-use crate::repository::{ISSUED_AT, canonical, role_keys};
+use crate::repository::{ISSUED_AT, canonical, check_root, read, role_keys};
 use async_trait::async_trait;
 use midshift_core::time::Utc;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -187,6 +188,18 @@ pub struct Refreshed {
     pub targets: BTreeMap<String, Listed>,
 }
 
+/// A refresh that failed.
+#[derive(Debug)]
+pub struct Unrefreshed {
+    /// Why nothing of the documents below the root is believed.
+    pub error: Error,
+    /// With the newer root that came all the same, to be written down; none: none came.
+    pub rooted: Option<Box<Trusted>>,
+}
+
+/// Documents as they came, by name.
+type Heard = BTreeMap<String, Vec<u8>>;
+
 impl Trusted {
     /// A robot that has only the root it came with.
     ///
@@ -259,6 +272,11 @@ impl Trusted {
         let time_floor = time.min(issued_at(&timestamp.signed)?.plus_ms(AHEAD_MS));
         is_later(time_floor).then(|| Self { time_floor, ..self.clone() })
     }
+    /// As it is, with a time floor that is no lower than this.
+    #[must_use]
+    pub fn at_least(self, floor: Utc) -> Self {
+        Self { time_floor: self.time_floor.max(floor), ..self }
+    }
     /// The moment that expiry is held against.
     pub fn now(&self, clock: Reading) -> Utc {
         if clock.is_synced { clock.utc.max(self.time_floor) } else { self.time_floor }
@@ -303,6 +321,24 @@ impl Trusted {
     /// # Errors
     /// Why nothing new is believed.
     pub async fn refresh(&self, source: Arc<dyn Source>, clock: Reading) -> Result<Refreshed, Error> {
+        self.refresh_or_root(source, clock).await.map_err(|failed| failed.error)
+    }
+
+    /// As [`Self::refresh`], for whoever writes a new root down also when the rest fails: step 5.3.8 of the specification. Else keys that the
+    /// new root has ended could sign for this robot again.
+    ///
+    /// # Errors
+    /// Why nothing else is believed, with the new root.
+    pub async fn refresh_or_root(&self, source: Arc<dyn Source>, clock: Reading) -> Result<Refreshed, Unrefreshed> {
+        let heard = Arc::new(Mutex::new(Heard::new()));
+        let asked = self.ask(source, clock, heard.clone()).await;
+        asked.map_err(|error| {
+            let heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
+            Unrefreshed { error, rooted: self.rooted(&heard).map(Box::new) }
+        })
+    }
+
+    async fn ask(&self, source: Arc<dyn Source>, clock: Reading, heard: Arc<Mutex<Heard>>) -> Result<Refreshed, Error> {
         let store = |source| Error::Store { doing: "unpacking", source };
         let folder = tempfile::tempdir().map_err(store)?;
         for (name, document) in
@@ -312,7 +348,6 @@ impl Trusted {
                 fs::write(folder.path().join(name), document).map_err(store)?;
             }
         }
-        let heard = Arc::new(Mutex::new(BTreeMap::new()));
         let nowhere = || Url::parse(NOWHERE).unwrap_or_else(|e| unreachable!("a constant: {e}"));
         let repository = RepositoryLoader::new(&self.root, nowhere(), nowhere())
             .transport(Recorder { source, heard: heard.clone() })
@@ -333,12 +368,7 @@ impl Trusted {
         self.believe(&repository, &heard, clock)
     }
 
-    fn believe(
-        &self,
-        repository: &tough::Repository,
-        heard: &BTreeMap<String, Vec<u8>>,
-        clock: Reading,
-    ) -> Result<Refreshed, Error> {
+    fn believe(&self, repository: &tough::Repository, heard: &Heard, clock: Reading) -> Result<Refreshed, Error> {
         let old = parsed(&self.root)?;
         let (root, timestamp) = (repository.root(), repository.timestamp());
         let (snapshot, targets) = (repository.snapshot(), repository.targets());
@@ -382,6 +412,42 @@ impl Trusted {
         });
         Ok(Refreshed { trusted, targets: listed.collect() })
     }
+
+    /// With the newest root that came, each signed as it and the one before ask; none: no newer one came. What was believed by keys that it
+    /// has ended counts no more (5.3.11).
+    fn rooted(&self, heard: &Heard) -> Option<Self> {
+        let old = read::<Root>("root", self.root.as_bytes()).ok()?.signed;
+        let (mut root, mut newest) = (self.root.as_bytes(), old.clone());
+        loop {
+            let number = newest.version.get().saturating_add(1);
+            let Some(next) = heard.get(&format!("{number}.root.json")) else { break };
+            let Ok(signed) = read::<Root>("root", next).map(|next| next.signed) else { break };
+            if signed.version.get() != number || check_root(root, next).is_err() {
+                break;
+            }
+            (root, newest) = (next.as_slice(), signed);
+        }
+        if newest.version == old.version {
+            return None;
+        }
+        let keeps = keeps(&old, &newest);
+        let has_same = |document: &Option<String>, kept: Kept| document.clone().filter(|_| keeps[&kept]);
+        let mut versions = self.versions.clone();
+        versions.retain(|kept, _| keeps[kept]);
+        versions.insert(Kept::Root, newest.version.get());
+        Some(Self {
+            origin: self.origin,
+            root: String::from_utf8_lossy(root).into_owned(),
+            // It names a snapshot: it goes with that one.
+            timestamp: has_same(&self.timestamp, Kept::Snapshot),
+            snapshot: has_same(&self.snapshot, Kept::Snapshot),
+            targets: has_same(&self.targets, Kept::Targets),
+            versions,
+            time_floor: self.time_floor,
+            own_time: Utc(0),
+            bugs: self.bugs,
+        })
+    }
 }
 
 /// When it was signed, as its signer says.
@@ -393,7 +459,7 @@ fn issued_at(timestamp: &Timestamp) -> Option<Utc> {
 #[derive(Clone, Debug)]
 struct Recorder {
     source: Arc<dyn Source>,
-    heard: Arc<Mutex<BTreeMap<String, Vec<u8>>>>,
+    heard: Arc<Mutex<Heard>>,
 }
 
 #[async_trait]

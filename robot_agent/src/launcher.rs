@@ -23,7 +23,7 @@ mod orders;
 
 use crate::starts::{self, Environment, Tries};
 use beacon::{BEACON_EVERY, Beacon};
-use choose::{Start, Unwritten, choose, is_trusted, machine_starts, number, write_held};
+use choose::{Start, Unwritten, choose, is_trusted, machine_starts, number, tries_before, write_held};
 use lock::LauncherLock;
 use orders::Orders;
 use std::fs;
@@ -114,7 +114,7 @@ fn keep_running(orders: &Orders) -> io::Result<()> {
     if let Some(sets) = &orders.sets {
         machine_starts(sets)?;
     }
-    let mut tries = read_tries(&orders.record);
+    let mut tries = tries_before(orders);
     let mut unwritten = Unwritten::default();
     let mut environment = Environment::default();
     loop {
@@ -281,9 +281,12 @@ impl Drop for Kept {
     }
 }
 
-/// Starts that did not run well. A record that cannot be read counts none.
-fn read_tries(record: &Path) -> Tries {
-    Tries::parse(&fs::read_to_string(record).unwrap_or_default())
+/// Starts that did not run well. Without a record there were none.
+fn read_tries(record: &Path) -> io::Result<Tries> {
+    match fs::read_to_string(record) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        text => Ok(Tries::parse(&text.unwrap_or_default())),
+    }
 }
 
 /// A record that cannot be written is no reason to stop a robot, or not to start it: this launcher counts on without it.

@@ -226,6 +226,7 @@ impl OldSite {
             succeeded: self.ended / self.robots.max(1),
             failures: Default::default(),
             stats: WorkStats::default(),
+            errands: WorkStats::default(),
             attached_ms: 1,
             counted: if is_retired { self.from } else { self.until },
         };

@@ -316,6 +316,9 @@ pub struct RobotCounter {
     pub failures: BTreeMap<u32, u64>,
     /// Sums over all attempts, errands included.
     pub stats: WorkStats,
+    /// Of these, of errands: a way to a charger costs time and energy for no task.
+    #[serde(default)]
+    pub errands: WorkStats,
     /// Milliseconds of site time in which it was heard, counted at the end of each attempt.
     pub attached_ms: u64,
     /// When it was counted last, UTC, site clock; 0: before this was noted.

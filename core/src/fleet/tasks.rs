@@ -190,7 +190,9 @@ pub fn end_attempt(tx: &mut Tx, a: &mut Attempt) {
 fn count(tx: &mut Tx, a: &Attempt) {
     let mut counter = counter(tx, &a.robot_id, &a.software);
     counter.stats += a.stats;
-    if a.errand.is_none() {
+    if a.errand.is_some() {
+        counter.errands += a.stats;
+    } else {
         match (a.phase, &a.fault) {
             (AttemptPhase::Succeeded, _) => counter.succeeded += 1,
             (AttemptPhase::Failed, Some(fault)) => *counter.failures.entry(fault.code).or_default() += 1,
@@ -219,6 +221,7 @@ fn counter(tx: &mut Tx, robot_id: &RobotId, software: &str) -> RobotCounter {
         succeeded: 0,
         failures: std::collections::BTreeMap::new(),
         stats: crate::work::WorkStats::default(),
+        errands: crate::work::WorkStats::default(),
         attached_ms: 0,
         counted: tx.now.utc,
     });

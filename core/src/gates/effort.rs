@@ -9,7 +9,7 @@ const TASKS_MIN: u64 = 5;
 /// Millimetres that each side must have driven for its energy to be compared.
 const PATH_MIN_MM: u64 = 100_000;
 
-/// What the work of some robots cost, errands included.
+/// What tasks cost some robots. Errands are not among them, but for heat.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Effort {
     /// Tasks that ended.

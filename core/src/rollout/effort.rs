@@ -10,14 +10,14 @@ use crate::gates::{Effort, EffortLimits, Efforts};
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
 
-/// Of one robot with one version, since ever.
+/// Of one robot with one version, since ever. How hot it was on an errand counts, and nothing else of one.
 fn of(counter: &RobotCounter) -> Effort {
-    let stats = counter.stats;
+    let (stats, errands) = (counter.stats, counter.errands);
     Effort {
         tasks: counter.succeeded.saturating_add(counter.failures.values().sum()),
-        duration_ms: stats.duration_ms,
-        path_mm: stats.path_mm,
-        energy_mwh: stats.energy_mwh,
+        duration_ms: stats.duration_ms.saturating_sub(errands.duration_ms),
+        path_mm: stats.path_mm.saturating_sub(errands.path_mm),
+        energy_mwh: stats.energy_mwh.saturating_sub(errands.energy_mwh),
         hottest_joint_decidegrees: stats.hottest_joint_decidegrees,
     }
 }
@@ -68,6 +68,9 @@ pub fn excess(efforts: &Efforts, limits: &EffortLimits) -> Option<Reason> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::time::Utc;
+    use crate::work::WorkStats;
+    use std::collections::BTreeMap;
 
     const CONTROL: Effort = Effort {
         tasks: 100,
@@ -93,6 +96,35 @@ mod tests {
         change(&mut trial);
         let reason = excess(&Efforts { trial, control: CONTROL }, &limits())?;
         reason.metadata.get("what").cloned()
+    }
+
+    #[test]
+    fn an_errand_costs_no_task_time_or_energy_and_its_heat_counts() {
+        let stats = |duration_ms, path_mm, energy_mwh| WorkStats {
+            path_mm,
+            loaded_path_mm: 0,
+            duration_ms,
+            energy_mwh,
+            hottest_joint_decidegrees: 700,
+        };
+        let counter = RobotCounter {
+            robot_id: RobotId::parse("r1").expect("an id"),
+            software: "1.0.0".to_owned(),
+            succeeded: 8,
+            failures: BTreeMap::from([(7, 2)]),
+            stats: stats(500_000, 300_000, 90),
+            errands: stats(100_000, 100_000, 30),
+            attached_ms: 0,
+            counted: Utc(0),
+        };
+        let expected = Effort {
+            tasks: 10,
+            duration_ms: 400_000,
+            path_mm: 200_000,
+            energy_mwh: 60,
+            hottest_joint_decidegrees: 700,
+        };
+        assert_eq!(of(&counter), expected);
     }
 
     #[test]

@@ -17,7 +17,7 @@ use crate::reason::{Code, Reason};
 pub struct Share {
     /// Robots that the bundle was offered to. Whom a person kept from it is not among them.
     pub offered: u32,
-    /// Of these, robots that keep it, or are about to. Where a roll-out takes one back: robots that went back.
+    /// Of these, robots that keep it, had it already, or are about to keep it. Where a roll-out takes one back: robots that went back.
     pub reached: u32,
 }
 
@@ -44,6 +44,9 @@ fn is_reached(rollout: &Rollout, r: &RolloutRobot) -> bool {
         Step::Committed | Step::Committing => rollout.revert_of.is_none(),
         // Its wave is kept: it is told so next.
         Step::Trial => r.failure.is_none() && r.wave < rollout.promoted,
+        Step::Skipped => {
+            rollout.revert_of.is_none() && r.why.as_ref().is_some_and(|why| why.code == Code::SkippedCurrent)
+        }
         _ => false,
     }
 }

@@ -326,6 +326,11 @@ fn due(view: &View) -> Vec<String> {
     for rollout in view.rollouts.values().map(|r| &r.row).filter(whole) {
         ids.extend(view.robots_of(&rollout.rollout_id).map(crate::rows::Record::id));
     }
+    let applies = |id: &&String| {
+        let row = view.robots.get(*id).map(|r| &r.row);
+        row.and_then(|r| view.rollout(&r.rollout_id)).is_some_and(|rollout| rollout.phase == Phase::Applying)
+    };
+    ids.extend(view.waiting_out.iter().filter(applies).cloned());
     let mut ids: Vec<String> = ids.into_iter().collect();
     let order = |id: &String| {
         view.robots.get(id).map(|r| (r.row.rollout_id.clone(), r.row.failure.is_none(), r.row.wave, r.row.place))

@@ -6,7 +6,7 @@
 use super::hear::{fail, is_hard, is_old, quarantine};
 use super::infrastructure::is_open_to;
 use super::robots::{Move, anchor, area_ahead, is_asked, wants};
-use super::rows::{Act, Given, Lost, Rollout, RolloutRobot, Step, WayBack};
+use super::rows::{Act, Given, Lost, RobotSoftware, Rollout, RolloutRobot, Step, WayBack};
 use super::stamp::Stamp;
 use super::turns::is_retried;
 use super::view::View;
@@ -42,8 +42,9 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             step(tx, r, Step::Skipped, "robot.skipped");
         }
         Move::Again => {
-            // If no wave was judged the waves begin anew, and each robot keeps its own.
-            r.wave = if rollout.wave < rollout.spec.waves.len() as u32 { r.wave } else { rollout.wave };
+            // If no wave was judged the waves begin anew, and each robot keeps its own. Nobody comes into one that was judged.
+            let is_last = rollout.wave >= rollout.spec.waves.len() as u32;
+            r.wave = if is_last { rollout.wave } else { r.wave.max(rollout.wave) };
             (r.again, r.why, r.ready) = (true, None, false);
             step(tx, r, Step::Waiting, "robot.tried_again");
         }
@@ -129,6 +130,13 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             step(tx, r, Step::Reverting, "robot.ordered_back_anew");
         }
         Move::RolledBack(why) => rolled_back(tx, &rollout, r, why),
+        Move::SetUpAnew => {
+            let known = tx.view.software_of(&r.robot_id);
+            let (committed, previous, on_trial, report) = (None, None, None, None);
+            let row = RobotSoftware { committed, previous, on_trial, report, since: tx.now.utc, ..known };
+            tx.put(row, "robot.software_changed");
+            rolled_back(tx, &rollout, r, Code::RevertAsked.into());
+        }
         Move::Stuck(why) => {
             let reason = Reason::from(Code::RollbackFailed).with("because", why.code).with("said", why.text());
             let reason = reason.with("rollout_id", &r.rollout_id);

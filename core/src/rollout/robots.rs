@@ -6,7 +6,7 @@
 
 use super::hear::{is_hard, is_old, report_of};
 use super::rows::{Given, Pause, Phase, Rollout, RolloutRobot, Step};
-use super::turns::{is_late, is_newcomer, is_on, is_retried};
+use super::turns::{is_late, is_newcomer, is_on, is_retried, waits_out};
 use super::view::View;
 use super::{Board, infrastructure, jams, matching, served, verdict};
 use crate::authority::Authority;
@@ -64,6 +64,8 @@ pub enum Move {
     OrderBackAnew,
     /// It runs what it ran before.
     RolledBack(Reason),
+    /// Somebody set it up anew, without the bundle: nothing is left to go back from.
+    SetUpAnew,
     /// It could not go back.
     Stuck(Reason),
     /// It is out of work and not heard for longer than the roll-out bears.
@@ -90,9 +92,9 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
         Step::Activating => activating(view, board, now, rollout, r, report),
         Step::Trial => trial(view, board, now, rollout, r, report),
         Step::Committing => committing(view, rollout, r, report),
-        Step::Reverting => reverting(view, board, now, r, report),
+        Step::Reverting => reverting(view, board, now, rollout, r, report),
         Step::Committed => goes_back(view, rollout, r).then_some(Move::Revert),
-        Step::Skipped if is_tried_again(rollout, r) => Some(Move::Again),
+        Step::Skipped if is_tried_again(now, rollout, r) => Some(Move::Again),
         Step::Skipped => keeps_for_nothing(view, rollout, r).then_some(Move::Forget),
         Step::RolledBack => None,
         // Somebody mended it.
@@ -105,8 +107,10 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
     due.or_else(|| (is_out && is_long()).then_some(Move::Lost))
 }
 
-fn is_tried_again(rollout: &Rollout, r: &RolloutRobot) -> bool {
-    rollout.second_pass && rollout.phase == Phase::Applying && !r.again && is_retried(r)
+fn is_tried_again(now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    let waited = waits_out(r).is_some_and(|wait_ms| now.ms_since(r.since) >= wait_ms);
+    let at_the_end = rollout.second_pass && !r.again && is_retried(r);
+    rollout.phase == Phase::Applying && (waited || at_the_end)
 }
 
 /// It has the bundle for a second try that will not come.
@@ -520,7 +524,26 @@ fn committing(view: &View, rollout: &Rollout, r: &RolloutRobot, report: Option<&
     }
 }
 
-fn reverting(view: &View, board: &Board, now: &Now, r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
+/// The robot knows of no update, and runs another version than that of the bundle.
+fn is_set_up_anew(view: &View, board: &Board, rollout: &Rollout, r: &RolloutRobot) -> bool {
+    let live = board.get(&r.robot_id).filter(|live| view.is_settled(live));
+    let runs = view.sessions.get(r.robot_id.as_str()).map(|s| &s.row.inventory.software);
+    let bundle = view.bundles.get(rollout.spec.bundle.as_str()).map(|b| &b.row.version);
+    let is_other = runs.zip(bundle).is_some_and(|(runs, bundle)| !runs.is_empty() && runs != bundle);
+    is_other && live.is_some_and(|live| live.report.update.is_none())
+}
+
+fn reverting(
+    view: &View,
+    board: &Board,
+    now: &Now,
+    rollout: &Rollout,
+    r: &RolloutRobot,
+    report: Option<&UpdateReport>,
+) -> Option<Move> {
+    if r.way_back.unstuck && is_set_up_anew(view, board, rollout, r) {
+        return Some(Move::SetUpAnew);
+    }
     // What it said before a person mended it is no answer to the order that follows.
     let report = report.filter(|said| said.state != UpdateState::Stuck || r.way_back.is_answered_by(said));
     if let Some(over) = ended(r, report) {

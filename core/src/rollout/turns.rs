@@ -2,7 +2,7 @@
 //!
 //! Called by every room that waits for a robot or passes one over.
 
-use super::rows::{Phase, Rollout, RolloutRobot};
+use super::rows::{Phase, Rollout, RolloutRobot, Step};
 use crate::limits;
 use crate::reason::Code;
 use crate::time::{Now, Utc};
@@ -36,6 +36,14 @@ const PASSING: [Code; 7] = [
 /// Whether a robot that was skipped is tried once more at the end.
 pub fn is_retried(r: &RolloutRobot) -> bool {
     r.why.as_ref().is_some_and(|why| PASSING.contains(&why.code))
+}
+
+/// How long, in milliseconds since it was skipped, a robot said that it must wait until it can take the bundle. None: it is not waited for, or was
+/// tried again.
+pub fn waits_out(r: &RolloutRobot) -> Option<u64> {
+    let why = r.why.as_ref().filter(|why| why.code == Code::BaseTooSoon)?;
+    let wait_ms = why.metadata.get("wait_ms")?.parse().ok()?;
+    (r.step == Step::Skipped && !r.again).then_some(wait_ms)
 }
 
 /// The robot's turn came long ago. The time in which the roll-out stood still does not count.

@@ -8,6 +8,7 @@
 use super::rows::{
     AreaBundle, Bundle, CommandKey, OtaClock, OtaMark, Quarantine, RobotSoftware, Rollout, RolloutRobot,
 };
+use super::turns::waits_out;
 use crate::fleet::Board;
 use crate::fleet::heard;
 use crate::fleet::rows::{AreaBudget, Drain, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
@@ -76,6 +77,8 @@ pub struct View {
     pub of_robot: BTreeMap<RobotId, BTreeSet<RolloutId>>,
     /// Ids of robots' rows that something may still be due for.
     pub open: BTreeSet<String>,
+    /// Ids of robots' rows that are skipped until a while is over that the robot told.
+    pub waiting_out: BTreeSet<String>,
     /// Roll-outs that the feed spoke of while they were not here. Volatile.
     pub spoken_of: BTreeSet<RolloutId>,
     /// Roll-outs that are named and that the store does not have. Volatile.
@@ -164,6 +167,11 @@ impl Viewed<View> for RolloutRobot {
         };
         if let Some(old) = old {
             size(&mut view.wave_sizes, old, -1);
+        }
+        if new.and_then(waits_out).is_some() {
+            view.waiting_out.insert(id.to_owned());
+        } else {
+            view.waiting_out.remove(id);
         }
         match new {
             Some(row) => {
@@ -292,6 +300,7 @@ impl View {
             lane_marks: Slot::new(),
             of_robot: BTreeMap::new(),
             open: BTreeSet::new(),
+            waiting_out: BTreeSet::new(),
             spoken_of: BTreeSet::new(),
             absent: BTreeSet::new(),
             wave_sizes: BTreeMap::new(),

@@ -6,7 +6,7 @@ use crate::metadata::rule;
 use crate::shelf::{Documents, START, Seeds, Shelf, key, signers, target};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::keys::{SecretKey, hex};
-use midshift_bundle::repository::{DAY_MS, PEOPLE_LIFE_MS, RootDraft, sign_root, sign_targets};
+use midshift_bundle::repository::{DAY_MS, PEOPLE_LIFE_MS, RootDraft, sign_online, sign_root, sign_targets};
 use midshift_bundle::trust::{Error, Reading, Refreshed, Trusted};
 use midshift_core::time::Utc;
 use olpc_cjson::CanonicalFormatter;
@@ -119,6 +119,61 @@ async fn steps_5_3_3_to_5_3_5_the_next_root_is_signed_by_both_and_has_the_next_n
     let mut forge = Forge(good);
     forge.put("3.root.json", next_root(&shelf, 3, ends, 12, &[12, shelf.seeds.root]));
     forge.refused(&after, "VerifyMetadata").await;
+}
+
+/// What a robot writes down of a refresh that fails.
+async fn rooted(shelf: &Shelf, robot: &Trusted) -> Option<Trusted> {
+    let failed = robot.refresh_or_root(Arc::new(shelf.documents.clone()), shelf.clock()).await.expect_err("fails");
+    failed.rooted.map(|rooted| *rooted)
+}
+
+#[tokio::test]
+async fn step_5_3_8_a_new_root_is_kept_though_a_later_step_fails_and_no_key_before_it_signs_again() {
+    let (shelf, robot) = repository().await;
+    let mut thief = shelf.clone();
+    thief.rotate(Seeds { root: 21, targets: 22, snapshot: 23, timestamp: 24 });
+    thief.release(&[]);
+    let mut broken = shelf.clone();
+    broken.rotate(Seeds { root: 11, ..shelf.seeds });
+    let good = broken.clone();
+    broken.documents.0.remove("timestamp.json");
+    let kept = rooted(&broken, &robot).await.expect("the new root");
+    believed(&thief, &robot).await;
+    Forge(thief).refused(&kept, "VerifyMetadata").await;
+    believed(&good, &kept).await;
+    assert_eq!(rooted(&broken, &kept).await, None, "nothing is new");
+    // A root that breaks a rule is none of those that are kept; the one before it is.
+    let ends = START.plus_ms(PEOPLE_LIFE_MS);
+    broken.documents.0.insert("3.root.json".to_owned(), next_root(&good, 3, ends, 12, &[12]));
+    assert_eq!(rooted(&broken, &robot).await, Some(kept));
+}
+
+#[tokio::test]
+async fn steps_5_3_8_and_5_3_11_a_root_that_was_kept_alone_begins_anew_after_a_fast_forward() {
+    let (mut shelf, robot) = repository().await;
+    let mut thief = shelf.clone();
+    thief.publish(1_000_000);
+    let driven = believed(&thief, &robot).await.trusted;
+    for seeds in [Seeds { snapshot: 13, timestamp: 14, ..shelf.seeds }, Seeds { snapshot: 15, ..shelf.seeds }] {
+        let same_timestamp = seeds.timestamp == shelf.seeds.timestamp;
+        let mut shelf = shelf.clone();
+        shelf.rotate(seeds);
+        shelf.documents.0.remove("timestamp.json");
+        let kept = rooted(&shelf, &driven).await.expect("the new root");
+        let (snapshot, timestamp) = (key(seeds.snapshot), key(seeds.timestamp));
+        let stamp = if same_timestamp { 1_000_001 } else { 3 };
+        let online = sign_online(&shelf.targets, 3, stamp, shelf.now, &snapshot, &timestamp).expect("online");
+        shelf.documents.0.insert("3.snapshot.json".to_owned(), online.snapshot);
+        shelf.documents.0.insert("timestamp.json".to_owned(), online.timestamp);
+        believed(&shelf, &kept).await;
+    }
+    // A root that leaves the keys leaves what was believed by them.
+    shelf.rotate(shelf.seeds);
+    let mut broken = shelf.clone();
+    broken.documents.0.remove("timestamp.json");
+    let kept = rooted(&broken, &driven).await.expect("the new root");
+    shelf.freshen();
+    Forge(shelf).refused(&kept, "OlderMetadata").await;
 }
 
 #[tokio::test]

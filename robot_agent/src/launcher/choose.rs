@@ -4,7 +4,7 @@
 //! starts. What is decided stands in [`crate::starts`] and [`crate::boot`]; here it is carried out.
 
 use super::orders::Orders;
-use super::{PROGRAM, SWITCH, say};
+use super::{PROGRAM, SWITCH, read_tries, say};
 use crate::boot::{BASE, BOOT, Boot, Image, Slot};
 use crate::starts::{self, Environment, Tries};
 use crate::switch::{self, Switch};
@@ -95,8 +95,21 @@ pub(super) fn choose(
     }
     let set = switch.running().to_owned();
     let own = sets.join(&set).join(PROGRAM);
-    let program = if own.exists() { own.to_string_lossy().into_owned() } else { orders.program.clone() };
+    // One that cannot be looked at is not absent: its start fails, and is a try of its set.
+    let brings_none = matches!(own.try_exists(), Ok(false));
+    let program = if brings_none { orders.program.clone() } else { own.to_string_lossy().into_owned() };
     Ok(Start { tries: tries.plus_one(&set), program, set, number })
+}
+
+/// Starts that did not run well before this launcher. A record that cannot be read speaks against a set that has proven nothing, as if it had
+/// had all its tries; any other is started.
+pub(super) fn tries_before(orders: &Orders) -> Tries {
+    read_tries(&orders.record).unwrap_or_else(|error| {
+        say(&format!("{} cannot be read: {error}; a set on probation is put away", orders.record.display()));
+        let switch = orders.sets.as_ref().and_then(|sets| Switch::read(&sets.join(SWITCH)).ok());
+        let unproven = switch.filter(|switch| !starts::is_trusted(switch));
+        unproven.map_or_else(Tries::default, |switch| Tries::new(switch.running(), starts::TRIES_MAX))
+    })
 }
 
 /// Writes a record that was held back, before the launcher ends.

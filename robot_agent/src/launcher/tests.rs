@@ -73,7 +73,8 @@ fn on_trial_by(set: &str, beside: &Path) {
 /// What a launcher that has just begun starts.
 fn chosen(orders: &Orders) -> Start {
     let (mut unwritten, mut environment) = (Unwritten::default(), Environment::default());
-    choose(orders, &read_tries(&orders.record), &mut unwritten, &mut environment, Duration::ZERO).expect("chooses")
+    choose(orders, &read_tries(&orders.record).expect("reads"), &mut unwritten, &mut environment, Duration::ZERO)
+        .expect("chooses")
 }
 
 fn record(orders: &Orders) -> Switch {
@@ -114,7 +115,7 @@ fn a_program_that_fails_is_started_again_until_it_ends_well_and_its_tries_are_on
         fs::read_to_string(&seen).expect("was written"),
         "tries 1 of factory\ntries 2 of factory\ntries 3 of factory\n"
     );
-    assert_eq!(read_tries(&orders.record).of("factory"), 0);
+    assert_eq!(read_tries(&orders.record).expect("reads").of("factory"), 0);
 }
 
 #[test]
@@ -160,7 +161,7 @@ fn a_program_that_switched_is_followed_by_the_set_it_wrote_at_once_and_not_count
     on_trial(&orders, "v0");
     keep_running(&orders).expect("runs");
     assert_eq!(ran(&folder), ["v1"]);
-    let tries = read_tries(&orders.record);
+    let tries = read_tries(&orders.record).expect("reads");
     assert_eq!((tries.of("v0"), tries.of("v1")), (0, 1), "the second one is on probation and has proven nothing");
 }
 
@@ -291,6 +292,36 @@ fn a_boot_record_that_cannot_be_written_leaves_the_machine_on_its_base_and_start
     assert_eq!(ran(&folder), ["factory"], "v1 needs another base");
     assert_eq!(boot(&orders), before);
     assert_eq!(record(&orders).fallen.map(|fallen| fallen.set), Some("v1".to_owned()));
+}
+
+#[test]
+fn a_program_that_cannot_be_looked_at_is_not_taken_for_one_that_the_set_does_not_bring() {
+    let (folder, orders) = with_sets(&[]);
+    let set = orders.sets.as_ref().expect("has sets").join("v1");
+    fs::create_dir(&set).expect("makes");
+    std::os::unix::fs::symlink(PROGRAM, set.join(PROGRAM)).expect("makes");
+    on_trial(&orders, "v1");
+    keep_running(&orders).expect("runs");
+    assert_eq!(ran(&folder), ["factory"], "its program ran as no other set");
+    assert_eq!(record(&orders).fallen, Some(switch::Fallen { set: "v1".to_owned(), tries: TRIES_MAX }));
+}
+
+#[test]
+fn tries_that_cannot_be_read_speak_against_a_set_on_probation_and_against_no_other() {
+    let (folder, orders) = with_sets(&[("v1", "exit 0")]);
+    fs::create_dir(&orders.record).expect("makes");
+    on_trial(&orders, "v1");
+    let path = orders.sets.as_ref().expect("has sets").join(SWITCH);
+    let mut switch = record(&orders);
+    switch.prove();
+    switch.write(&path).expect("writes");
+    keep_running(&orders).expect("runs");
+    on_trial(&orders, "v1");
+    for _ in 0..2 {
+        keep_running(&orders).expect("runs");
+    }
+    assert_eq!(ran(&folder), ["v1", "factory", "factory"]);
+    assert_eq!(record(&orders).fallen, Some(switch::Fallen { set: "v1".to_owned(), tries: TRIES_MAX }));
 }
 
 #[test]

@@ -3,7 +3,7 @@
 //! Invariant: what the repository says is written down before a directive is held against it; a new key counts only by the rule of
 //! [`midshift_bundle::key_set`]. Called by the machine.
 
-use super::{HeldKeys, Job, SoftwareRow, Update};
+use super::{Done, HeldKeys, Job, SoftwareRow, Update};
 use crate::core::AgentCore;
 use crate::store::Op;
 use midshift_bundle::bugs::Bugs;
@@ -124,6 +124,18 @@ impl AgentCore {
         }
     }
 
+    /// Writes down what is believed of a refresh that failed, a newer root first of all. The time floor may have risen meanwhile.
+    pub(super) fn believe_what_came(&mut self, done: Done) -> Done {
+        match done {
+            Done::Believed { trusted, failure } => {
+                let floor = self.kept.ledger.trusted.as_ref().map_or(Utc(0), |known| known.time_floor());
+                self.write(Op::Trusted(Arc::new(trusted.at_least(floor))), true);
+                Done::Failed(failure)
+            }
+            done => done,
+        }
+    }
+
     /// The repository has answered: what it says is believed first, then the directive is held against it.
     pub(super) fn refreshed(&mut self, now: &Now, mut refreshed: Refreshed, key_sets: &BTreeMap<u64, Vec<u8>>) {
         // What it was told meanwhile counts beside what was signed.
@@ -146,6 +158,7 @@ impl AgentCore {
             return;
         }
         match self.open(&desired, time) {
+            Ok(_) if self.goes_back_first(&desired) => {}
             Ok(directive) => {
                 self.update.judged = Some(desired.directive.clone());
                 self.update.fetched.clear();
@@ -168,6 +181,23 @@ impl AgentCore {
             }
             Err(reason) => self.refuse_directive(reason),
         }
+    }
+
+    /// A newer order has come to a robot that is stuck with a set on trial: its kept set is read again and gone back to, and the order is looked
+    /// at after that. One that is stuck still does not take it.
+    fn goes_back_first(&mut self, desired: &DesiredUpdate) -> bool {
+        let on_trial = self.update.holdings.as_ref().is_some_and(|holdings| holdings.switch.trial.is_some());
+        let stuck = self.kept.ledger.software.update.clone().filter(|u| on_trial && u.state == UpdateState::Stuck);
+        let Some(update) = stuck else { return false };
+        if self.update.back_first.as_ref() == Some(&desired.directive) {
+            self.refuse_directive(update.reason.unwrap_or_else(|| Code::KeptSetBad.into()));
+            return true;
+        }
+        self.update.back_first = Some(desired.directive.clone());
+        let (state, reason) = (UpdateState::RollingBack, Some(Reason::from(Code::RevertAsked)));
+        let drain_id = desired.drain_id.clone().or(update.drain_id.clone());
+        self.put_update(Update { state, drain_id, reason, ..update });
+        true
     }
 
     fn open(&self, desired: &DesiredUpdate, now: Utc) -> Result<Directive, Reason> {

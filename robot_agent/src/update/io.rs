@@ -27,11 +27,6 @@ pub const RANGE_BYTES: u64 = 4 * 1024 * 1024;
 /// What came is made durable this often, if it does not become so by its amount.
 const SYNC_EVERY: Duration = Duration::from_secs(2);
 
-/// A shorter way that is not made within this is not waited for.
-const WAY_WITHIN: Duration = Duration::from_secs(600);
-/// Nobody is asked more often.
-const ASK_AGAIN_MIN: Duration = Duration::from_millis(500);
-
 /// Bytes of one range, in order, in pieces of any length.
 pub type Pieces = std::pin::Pin<Box<dyn tokio_stream::Stream<Item = io::Result<Vec<u8>>> + Send>>;
 
@@ -60,8 +55,11 @@ pub enum Way {
         /// What is fetched.
         encoded: Wanted,
     },
-    /// A shorter way is being made: ask again after this.
-    AskAgain(Duration),
+}
+
+/// Whether a file of so many bytes may come by a shorter way; others come as they are.
+pub(super) fn may_come_encoded(length: u64) -> bool {
+    (ENCODED_BYTES_MIN..=ENCODED_BYTES_MAX).contains(&length)
 }
 
 /// Does jobs.
@@ -179,14 +177,24 @@ impl UpdateWorker {
     }
 
     async fn refresh(&self, trusted: &Trusted, clock: Reading, keys_after: u64) -> Done {
-        match trusted.refresh(Arc::new(Metadata(self.remote.clone())), clock).await {
+        let failed = match trusted.refresh_or_root(Arc::new(Metadata(self.remote.clone())), clock).await {
             Ok(refreshed) => match self.key_sets(&refreshed, keys_after).await {
-                Ok(key_sets) => Done::Refreshed { refreshed: Box::new(refreshed), key_sets },
-                Err(error) => later(error),
+                Ok(key_sets) => return Done::Refreshed { refreshed: Box::new(refreshed), key_sets },
+                Err(error) => {
+                    let (trusted, failure) = (Box::new(refreshed.trusted), Failure::Later(error.to_string()));
+                    return Done::Believed { trusted, failure };
+                }
             },
-            Err(error) if error.is_unreachable() => later(error),
-            Err(error @ trust::Error::Store { .. }) => later(error),
-            Err(error) => refused(Reason::new(Code::MetadataRefused, error.to_string())),
+            Err(failed) => failed,
+        };
+        let failure = match failed.error {
+            error if error.is_unreachable() => Failure::Later(error.to_string()),
+            error @ trust::Error::Store { .. } => Failure::Later(error.to_string()),
+            error => Failure::Refused(Reason::new(Code::MetadataRefused, error.to_string())),
+        };
+        match failed.rooted {
+            Some(trusted) => Done::Believed { trusted, failure },
+            None => Done::Failed(failure),
         }
     }
 
@@ -245,8 +253,8 @@ impl UpdateWorker {
         let missing = self.on_disk(move |sets| sets.missing(&wanted)).await.map_err(stopped)?;
         let begun = missing.iter().map(|range| range.end - range.start).sum::<u64>() < wanted.length;
         let noted = self.on_disk(move |sets| sets.is_fetched_as_it_is(&wanted)).await.map_err(stopped)?;
-        let worth = (ENCODED_BYTES_MIN..=ENCODED_BYTES_MAX).contains(&wanted.length);
-        if worth && !begun && !noted && self.fetch_shorter(wanted, bases, pace, leave).await? {
+        if may_come_encoded(wanted.length) && !begun && !noted && self.fetch_shorter(wanted, bases, pace, leave).await?
+        {
             return Ok(());
         }
         self.fetch_whole(wanted, pace, leave).await
@@ -260,13 +268,13 @@ impl UpdateWorker {
         pace: &mut Pace,
         leave: &CancellationToken,
     ) -> Result<bool, Stop> {
-        let Some((base, encoded)) = self.shorter(wanted, bases, leave).await? else { return Ok(false) };
+        let Some((base, encoded)) = self.shorter(wanted, bases).await? else { return Ok(false) };
         let failed = match self.fetch_whole(encoded, pace, leave).await {
             Ok(()) => match self.on_disk(move |sets| sets.decode(&wanted, base.as_ref(), &encoded)).await {
                 Ok(()) => return Ok(true),
                 Err(error) => error.to_string(),
             },
-            // The server needed its room: it may be made again one day, and the file comes as it is now.
+            // It was withdrawn meanwhile: the file comes as it is.
             Err(Stop::Gone(_)) => return Ok(false),
             Err(Stop::Failed(Failure::Refused(reason))) => reason.text().to_owned(),
             Err(later) => return Err(later),
@@ -276,31 +284,14 @@ impl UpdateWorker {
         Ok(false)
     }
 
-    /// A shorter way that the server names and that can lead there. While one is made it is waited for, up to [`WAY_WITHIN`].
-    async fn shorter(
-        &self,
-        wanted: Wanted,
-        bases: &[Digest],
-        leave: &CancellationToken,
-    ) -> Result<Option<(Option<Digest>, Wanted)>, Stop> {
-        let begun = Instant::now();
-        loop {
-            match self.remote.way(&wanted, bases).await.map_err(unreached)? {
-                Way::AsItIs => return Ok(None),
-                Way::Shorter { base, encoded } => {
-                    let is_one =
-                        encoded.length > 0 && encoded.length < wanted.length && encoded.digest != wanted.digest;
-                    let has_base = base.is_none_or(|base| bases.contains(&base));
-                    return Ok((is_one && has_base).then_some((base, encoded)));
-                }
-                Way::AskAgain(after) if begun.elapsed() < WAY_WITHIN => tokio::select! {
-                    biased;
-                    () = leave.cancelled() => return Err(unreached("left")),
-                    () = tokio::time::sleep(after.clamp(ASK_AGAIN_MIN, WAY_WITHIN)) => {}
-                },
-                Way::AskAgain(_) => return Ok(None),
-            }
-        }
+    /// A shorter way that the server names and that can lead there.
+    async fn shorter(&self, wanted: Wanted, bases: &[Digest]) -> Result<Option<(Option<Digest>, Wanted)>, Stop> {
+        let Way::Shorter { base, encoded } = self.remote.way(&wanted, bases).await.map_err(unreached)? else {
+            return Ok(None);
+        };
+        let is_one = encoded.length > 0 && encoded.length < wanted.length && encoded.digest != wanted.digest;
+        let has_base = base.is_none_or(|base| bases.contains(&base));
+        Ok((is_one && has_base).then_some((base, encoded)))
     }
 
     /// Fetches what is missing and checks the whole.

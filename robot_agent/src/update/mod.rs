@@ -1,11 +1,12 @@
 //! The robot's updater without IO: which bytes to fetch, when to switch, when to go back.
 //!
 //! Rooms: here what it knows and asks for; `pursue` is the machine; `believes` is what it holds directives against; `migrate` is what follows a commit; `io` does the jobs; `remote` asks the server;
-//! `again` says how long is waited for what failed. Called by the core.
+//! `again` says how long is waited for what failed; `behind` mends a switch record that is older than the ledger. Called by the core.
 //! Invariant: each side effect is a [`Job`], and a job begins only after the ledger row that explains it is durable; at most one job is
-//! under way. The switch record wins over the ledger.
+//! under way. The switch record wins over the ledger, unless it has on trial what the ledger has committed.
 
 mod again;
+mod behind;
 mod believes;
 pub mod io;
 pub mod migrate;
@@ -204,6 +205,13 @@ pub enum Done {
         /// Envelopes of newer sets of directive keys, by the number under which they are listed.
         key_sets: BTreeMap<u64, Vec<u8>>,
     },
+    /// The repository gave something to be believed, and not what was asked for.
+    Believed {
+        /// What is believed now.
+        trusted: Box<Trusted>,
+        /// Why not the rest.
+        failure: Failure,
+    },
     /// A manifest.
     Manifest(Box<Manifest>),
     /// Done as asked.
@@ -250,6 +258,8 @@ pub(crate) struct Updater {
     pub(crate) floor: Option<(Utc, LinkTime)>,
     /// Generation of the section whose order to go back was refused because nothing is kept.
     pub(crate) no_way_back: Option<u64>,
+    /// Envelope of a newer order for which a stuck robot has tried to go back.
+    pub(crate) back_first: Option<String>,
     /// Content that is known to be there.
     pub(crate) fetched: BTreeSet<Digest>,
     /// Bytes that are there and those that are needed.

@@ -3,7 +3,7 @@
 //! Invariant: level-triggered. It may be called at any moment and any number of times; what it decides is written down before it is done.
 
 use super::believes::refusal_of;
-use super::{Done, Failure, Job, SoftwareRow, Update, again, migrate};
+use super::{Done, Failure, Job, SoftwareRow, Update, again, io, migrate};
 use crate::core::{AgentCore, ExitReason, Output};
 use crate::sets::{Holdings, Wanted};
 use crate::store::Op;
@@ -117,6 +117,7 @@ impl AgentCore {
     /// Takes what came of the job under way.
     pub(crate) fn job_done(&mut self, now: &Now, done: Done) {
         let Some(job) = self.update.running.take() else { return };
+        let done = self.believe_what_came(done);
         if std::mem::take(&mut self.update.drops) && matches!(job, Job::Fetch { .. }) && !matches!(done, Done::Ok) {
             return;
         }
@@ -233,12 +234,7 @@ impl AgentCore {
     fn without_update(&mut self, now: &Now, holdings: &Holdings) -> Option<ExitReason> {
         let update = self.kept.ledger.software.update.as_ref();
         let is_stuck = update.is_some_and(|u| u.state == UpdateState::Stuck);
-        if holdings.switch.trial.is_some() && !is_stuck {
-            // The ledger knows of no trial: the set that was committed is gone back to.
-            let mut switch = holdings.switch.clone();
-            switch.go_back();
-            self.update.went_back = true;
-            self.ask_for(Job::Write(switch));
+        if !is_stuck && self.end_unknown_trial(&holdings.switch) {
             return None;
         }
         if self.update.went_back {
@@ -331,9 +327,9 @@ impl AgentCore {
             self.put_update(Update { state, drain_id, reason, ..update });
             return true;
         }
-        let set = holdings.set(&holdings.switch.current).filter(|set| set.bundle == Some(directive.manifest));
-        let Some(set) = set else {
-            self.refuse_directive(Reason::new(Code::DirectiveRefused, "another bundle is the committed one"));
+        let committed = holdings.set(&holdings.switch.current).filter(|_| holdings.switch.trial.is_none());
+        let Some(set) = committed.filter(|set| set.bundle == Some(directive.manifest)) else {
+            self.refuse_directive(Reason::new(Code::DirectiveRefused, "another bundle is the committed one, or runs"));
             return false;
         };
         let row = software.with(&directive, &desired);
@@ -423,7 +419,9 @@ impl AgentCore {
             return self.move_to(UpdateState::Refused, Some(reason));
         }
         let base = set.base().filter(|_| set.changes_base(&current)).map_or(0, |base| base.length);
-        let needed: u64 = manifest.components.iter().map(|c| c.length).sum::<u64>() + base;
+        // A file that comes encoded is there until its component is made of it.
+        let encoded = manifest.components.iter().map(|c| c.length).filter(|length| io::may_come_encoded(*length)).max();
+        let needed = manifest.components.iter().map(|c| c.length).sum::<u64>() + encoded.unwrap_or(0) + base;
         if needed > holdings.free_bytes {
             let reason =
                 Reason::from(Code::NoRoom).with("needed_bytes", needed).with("free_bytes", holdings.free_bytes);
@@ -631,6 +629,7 @@ impl AgentCore {
             return self.put_update(Update { state, tries, reason: Some(reason), ..update });
         }
         match update.state {
+            UpdateState::Committed if fallen.is_some() => self.has_fallen(update, fallen.map_or(0, |f| f.tries)),
             UpdateState::Switching if runs => self.move_to(UpdateState::Probation, None),
             // The power went before the record was written: the grant was not used.
             UpdateState::Switching => self.move_to(UpdateState::Staged, None),
@@ -727,7 +726,7 @@ impl AgentCore {
         wanted && !(update.state == UpdateState::Committed && update.is_irreversible)
     }
 
-    fn go_back(&mut self, update: Update, reason: Reason) {
+    pub(super) fn go_back(&mut self, update: Update, reason: Reason) {
         if update.state == UpdateState::Committed && !self.kept.ledger.software.due.is_empty() {
             self.put_software(SoftwareRow { due: Vec::new(), ..self.kept.ledger.software.clone() });
         }

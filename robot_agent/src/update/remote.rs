@@ -19,7 +19,6 @@ use std::io;
 use std::ops::Range;
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
-use std::time::Duration;
 use tokio::time::Sleep;
 use tokio_stream::Stream;
 use tonic::{Code, Streaming};
@@ -99,9 +98,6 @@ impl Remote for GrpcRemote {
 
 /// What an answer says; one that makes no sense is none.
 fn way(answer: &GetEncodingResponse) -> Way {
-    if answer.ask_again_ms > 0 {
-        return Way::AskAgain(Duration::from_millis(answer.ask_again_ms.into()));
-    }
     let encoded = |digest: Digest| Wanted { digest, length: answer.encoded_length };
     let base = match answer.encoding() {
         Encoding::Zstd => Ok(None),

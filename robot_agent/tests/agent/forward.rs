@@ -14,10 +14,15 @@ fn indexed(releases: &Releases, version: &str, index: u64) -> Bundle {
     releases.release_as(version, |manifest| manifest.components[0].rollback_index = index)
 }
 
-/// The newest versions of metadata that the robot has believed: timestamp and snapshot.
-fn is_forward(rig: &Rig) -> bool {
+/// What the robot has believed, as it is written down.
+fn believed(rig: &Rig) -> serde_json::Value {
     let trusted = rig.store.kept().expect("loaded").ledger.trusted.clone().expect("believes something");
-    serde_json::to_string(&*trusted).expect("is JSON").contains(&FORWARD.to_string())
+    serde_json::to_value(&*trusted).expect("is JSON")
+}
+
+/// Whether the newest versions of metadata are the thief's: timestamp and snapshot.
+fn is_forward(rig: &Rig) -> bool {
+    believed(rig).to_string().contains(&FORWARD.to_string())
 }
 
 /// Tells the robot to stage a bundle; why it did not even look at it, if so.
@@ -72,4 +77,21 @@ fn after_a_fast_forward_and_a_root_rotation_the_next_good_bundle_is_taken_and_ne
     releases.replay(&newest);
     let rig = committed(rig, &releases, &indexed(&releases, "1.4.0", 5), 11);
     assert_eq!(switch(&rig).previous.as_deref(), Some(runs.current.as_str()));
+}
+
+#[test]
+fn a_new_root_is_written_down_though_nothing_is_signed_with_its_keys_yet() {
+    let (mut rig, releases) = connected();
+    let [first, second] = ["1.0.0", "1.1.0"].map(|version| releases.release(version));
+    assert_eq!(told(&mut rig, &releases, &first, 1), None);
+    let floor = believed(&rig)["time_floor"].clone();
+    releases.rotate((13, 14));
+    assert_eq!(told(&mut rig, &releases, &second, 2), Some(Code::MetadataRefused));
+    let after = believed(&rig);
+    assert_eq!((&after["versions"]["root"], &after["time_floor"]), (&serde_json::json!(2), &floor));
+    let mut rig = rig.restart();
+    rig.connect();
+    assert_eq!(told(&mut rig, &releases, &second, 3), Some(Code::MetadataRefused), "keys of before are ended");
+    releases.pass(1_000);
+    assert_eq!((told(&mut rig, &releases, &second, 4), state(&rig)), (None, Some(UpdateState::Staged)));
 }

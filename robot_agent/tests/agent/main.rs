@@ -1,6 +1,7 @@
 //! What a robot does with what it is told, on a bench: no network, no clock, no disk but those of the test.
 
 mod bases;
+mod behind;
 mod beside;
 mod chaos;
 mod crowded;
@@ -33,6 +34,7 @@ mod stops;
 mod stops_beside;
 #[path = "../../../tests/src/strace.rs"]
 mod strace;
+mod stuck;
 mod successor;
 mod thief;
 mod told_time;

@@ -407,14 +407,11 @@ async fn a_shorter_way_is_asked_for_with_what_is_there_and_an_answer_without_sen
         base_digest: old.to_string(),
         encoded_digest: way.to_string(),
         encoded_length: 7,
-        ask_again_ms: 0,
     };
     let encoded = Wanted { digest: way, length: 7 };
     assert_eq!(bench.way(answer.clone()).await, Way::Shorter { base: Some(old), encoded });
     let zstd = GetEncodingResponse { encoding: Encoding::Zstd.into(), ..answer.clone() };
     assert_eq!(bench.way(zstd).await, Way::Shorter { base: None, encoded });
-    let soon = GetEncodingResponse { ask_again_ms: 2_000, ..answer.clone() };
-    assert_eq!(bench.way(soon).await, Way::AskAgain(std::time::Duration::from_secs(2)));
     let senseless = [
         GetEncodingResponse::default(),
         GetEncodingResponse { encoding: 77, ..answer.clone() },

@@ -275,13 +275,20 @@ fn what_does_not_fit_the_robot_is_refused_before_its_bytes_come() {
 }
 
 #[test]
-fn a_robot_without_room_says_so_and_keeps_what_it_has() {
-    let (mut rig, releases) = connected();
-    let bundle = releases.release("1.1.0");
-    rig.updates.as_ref().expect("has them").sets.limit(bundle.length + 1_000);
-    stage(&mut rig, &releases, &bundle, 1);
-    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Refused), Some(Code::NoRoom)));
-    assert_eq!(switch(&rig), Switch::default());
+fn a_robot_without_room_for_a_bundle_and_its_longest_file_as_it_comes_says_so_and_keeps_what_it_has() {
+    for missing in [1, 0] {
+        let (mut rig, releases) = connected();
+        let bundle = releases.release("1.1.0");
+        let lengths = bundle.manifest.components.iter().map(|c| c.length);
+        let needed = lengths.clone().sum::<u64>() + lengths.max().expect("a program");
+        rig.updates.as_ref().expect("has them").sets.limit(needed - missing);
+        rig.pass(130_000);
+        stage(&mut rig, &releases, &bundle, 1);
+        let refused = (Some(UpdateState::Refused), Some(Code::NoRoom));
+        let expected = if missing > 0 { refused } else { (Some(UpdateState::Staged), None) };
+        assert_eq!((state(&rig), why(&rig)), expected, "{missing}");
+        assert_eq!(switch(&rig), Switch::default());
+    }
 }
 
 #[test]

@@ -11,7 +11,7 @@ use midshift_store::StoreId;
 use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
 use std::fs::{self, File, OpenOptions};
-use std::io;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -26,6 +26,8 @@ const IN_USE: &str = "in-use.lock";
 pub const CONTENT: &str = "content.lock";
 /// Locked by whoever changes documents, or must not have them changed.
 pub const METADATA: &str = "metadata.lock";
+/// Shorter ways that a server before 0.2.0 made.
+const ENCODED: &str = "encoded";
 /// What a new file system has by itself.
 const LOST_AND_FOUND: &str = "lost+found";
 /// Between two looks at a lock that another process holds.
@@ -134,6 +136,19 @@ pub fn must_be_of(folder: &Path, expected: &StoreId) -> Result<(), Error> {
         return Ok(());
     }
     Err(Error::NoMarker { folder: folder.to_owned(), expected: expected.clone() })
+}
+
+/// Takes away what servers once made of files and nobody reads any more: who signs a release makes its shorter ways. Blocks.
+pub fn remove_encoded(folder: &Path) {
+    let encoded = folder.join(ENCODED);
+    match fs::remove_dir_all(&encoded) {
+        Ok(()) => {
+            tracing::info!(path = %encoded.display(), "shorter ways that an older server had made were taken away")
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+        // It takes room, and is in nobody's way.
+        Err(error) => tracing::warn!(path = %encoded.display(), %error, "a folder that nobody reads any more stays"),
+    }
 }
 
 fn is_empty(folder: &Path) -> Result<bool, Disk> {
@@ -258,11 +273,19 @@ impl Presence {
     }
 }
 
-/// Draws the next number. Nobody else does so meanwhile. After a loss of power it may be one that was drawn before: of a process that is no more.
+/// Draws the next number, durable before anybody has it: where several machines share the volume, one that loses its power forgets none that another
+/// has drawn. Nobody else does so meanwhile. The file is the one that is locked, so it is written over in place, and is never shorter than its number.
 fn next_number(path: &Path) -> Result<u64, Disk> {
     let text = fs::read_to_string(path).map_err(at("reading", path))?;
     let number = text.trim().parse::<u64>().unwrap_or(0) + 1;
-    fs::write(path, number.to_string()).map_err(at("writing", path))?;
+    let text = format!("{number:020}\n");
+    let write = || {
+        let mut file = OpenOptions::new().write(true).open(path)?;
+        file.write_all(text.as_bytes())?;
+        file.set_len(text.len() as u64)?;
+        file.sync_all()
+    };
+    write().map_err(at("writing", path))?;
     Ok(number)
 }
 

@@ -69,9 +69,16 @@ impl Hatch {
         Err(Refusal::new(Kind::Denied, Reason::from(Code::RobotNotEnrolled).with("robot_id", robot_id)))
     }
 
-    /// Signed files that were found damaged since this was asked last.
-    pub(crate) fn take_damaged(&self) -> BTreeSet<Digest> {
-        self.shown.as_ref().map(|shown| shown.integrity.take_damaged()).unwrap_or_default()
+    /// Signed files that were found damaged and that nobody was told of.
+    pub(crate) fn damaged(&self) -> BTreeSet<Digest> {
+        self.shown.as_ref().map(|shown| shown.integrity.untold()).unwrap_or_default()
+    }
+
+    /// People were told of these.
+    pub(crate) fn told_damaged(&self, files: &BTreeSet<Digest>) {
+        if let Some(shown) = &self.shown {
+            shown.integrity.told(files);
+        }
     }
 
     pub(crate) fn shown(&self) -> Result<&Shown, Refusal> {

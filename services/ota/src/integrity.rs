@@ -96,9 +96,14 @@ impl Integrity {
         Ok(false)
     }
 
-    /// Files that were found damaged since this was asked last.
-    pub fn take_damaged(&self) -> BTreeSet<Digest> {
-        std::mem::take(&mut *self.damaged())
+    /// Files that were found damaged and that nobody was told of.
+    pub fn untold(&self) -> BTreeSet<Digest> {
+        self.damaged().clone()
+    }
+
+    /// People were told of these.
+    pub fn told(&self, files: &BTreeSet<Digest>) {
+        self.damaged().retain(|digest| !files.contains(digest));
     }
 }
 

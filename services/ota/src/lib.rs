@@ -112,6 +112,9 @@ impl OtaService {
         let sharing = sharing.map(|presence| (presence.number, presence.is_first));
         let of = folder.clone();
         let (content, collector) = blocking(move || {
+            if sharing.is_none_or(|(_, is_first)| is_first) {
+                folder::remove_encoded(&of);
+            }
             let files = of.join("content");
             let collector = Collector::open(&of, room)?;
             let Some((number, is_first)) = sharing else {

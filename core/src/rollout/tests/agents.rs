@@ -183,6 +183,7 @@ impl Rig {
             succeeded: 0,
             failures: BTreeMap::new(),
             stats: WorkStats::default(),
+            errands: WorkStats::default(),
             attached_ms: 0,
             counted: Default::default(),
         });

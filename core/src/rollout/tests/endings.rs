@@ -49,6 +49,16 @@ fn whom_a_person_keeps_out_was_not_offered_it() {
 }
 
 #[test]
+fn whoever_had_the_bundle_already_ends_with_it() {
+    let mut rig = Rig::new(4);
+    rig.start(RolloutSpec { complete_percent: 100, ..spec() });
+    rig.fates(Fate::Refuses(Code::SkippedCurrent));
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    assert_eq!((rig.count(Step::Skipped), outcome(&rig, "ro")), (4, Some(Ending::Complete)));
+    assert_eq!(rig.incidents(), []);
+}
+
+#[test]
 fn robots_that_are_tried_again_complete_it_and_then_newcomers_get_it() {
     let (mut rig, n) = four_of_five(90);
     assert_eq!(outcome(&rig, "ro"), Some(Ending::Incomplete));

@@ -111,6 +111,30 @@ fn a_refusal_keeps_its_own_reason_and_one_that_may_pass_is_asked_once_more_at_th
 }
 
 #[test]
+fn a_robot_whose_base_came_too_soon_is_asked_again_after_its_wait_and_in_no_wave_that_was_judged() {
+    const WAIT_MS: u64 = 30_000;
+    let waves = vec![Wave::Count(1), Wave::Count(1), Wave::Count(1), Wave::Rest];
+    let mut rig = Rig::new(7);
+    rig.start(RolloutSpec { waves, soak_ms: 20_000, ..spec() });
+    let n = rig.order()[0];
+    rig.robots[n].fate = Fate::NoBytes;
+    rig.tick();
+    let reason = Some(Reason::from(Code::BaseTooSoon).with("wait_ms", WAIT_MS));
+    let told = rig.robots[n].report.clone().expect("an update");
+    rig.tell(n, UpdateReport { state: UpdateState::Refused, reason, ..told });
+    rig.robots[n].fate = Fate::Good;
+    rig.until(10, |r| r.step(n) == Step::Skipped);
+    let skipped = rig.now.utc;
+    rig.until(400, |r| r.step(n) != Step::Skipped);
+    assert!(rig.now.utc.ms_since(skipped) >= WAIT_MS, "not before");
+    let (r, rollout) = (rig.of("ro", n), rig.rollout("ro"));
+    assert_eq!((r.again, r.wave, rollout.phase, rollout.second_pass), (true, rollout.wave, Phase::Applying, false));
+    assert!((1..=3).contains(&r.wave), "wave {}", r.wave);
+    rig.until(400, |r| r.phase() == Phase::Completed);
+    assert_eq!((rig.step(n), rig.rollout("ro").second_pass), (Step::Committed, false));
+}
+
+#[test]
 fn a_robot_that_has_the_bundle_already_is_left_alone_and_known_to_have_it() {
     let rig = refused_for(Code::SkippedCurrent);
     assert!(!rig.rollout("ro").second_pass);

@@ -92,6 +92,30 @@ fn a_robot_that_kept_nothing_and_was_mended_is_ordered_back_once_more() {
 }
 
 #[test]
+fn a_stuck_robot_that_was_set_up_anew_is_told_as_back_and_one_that_runs_the_bundle_is_not() {
+    for version in ["0.9.0", "2.0.0"] {
+        let mut rig = half();
+        let n = rig.order()[0];
+        rig.robots[n].fate = Fate::KeepsNothing;
+        rig.must("ro", Verb::Abort);
+        rig.until(100, |r| r.phase() == Phase::Aborted);
+        assert_eq!((rig.step(n), rig.robots[n].version.as_str()), (Step::Stuck, "2.0.0"));
+        rig.robots[n].report = None;
+        rig.robots[n].version = version.to_owned();
+        rig.attach(n, |_| {});
+        rig.ticks(5);
+        assert_eq!(rig.step(n), Step::Stuck, "nobody has said so");
+        rig.ask(&unstick(n)).expect("it is stuck");
+        rig.until(60, |r| r.step(n) != Step::Reverting);
+        let (end, incidents) = if version == "0.9.0" { (Step::RolledBack, 1) } else { (Step::Stuck, 2) };
+        assert_eq!((rig.step(n), stuck(&rig).len()), (end, incidents), "{version}");
+        let software: RobotSoftware = rig.row(robot_id(n).as_str()).expect("a row");
+        assert_eq!(software.committed.is_none(), end == Step::RolledBack, "{version}");
+        assert_eq!(rig.rollout("ro").in_flight, u32::from(end == Step::Stuck));
+    }
+}
+
+#[test]
 fn what_a_stuck_robot_said_before_it_was_mended_does_not_make_it_stuck_again() {
     let mut rig = half();
     let n = rig.order()[0];

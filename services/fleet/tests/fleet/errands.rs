@@ -1,6 +1,7 @@
 //! Charging and parking: what fleet asks of robots without a task.
 
 use crate::harness::{Answer, World};
+use midshift_core::fleet::rows::RobotCounter;
 use midshift_core::reason::Code;
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
@@ -8,6 +9,7 @@ use midshift_core::task::state::Errand;
 use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
+use midshift_store::load;
 
 #[tokio::test(start_paused = true)]
 async fn a_robot_with_little_charge_is_sent_to_a_charger_before_any_task() {
@@ -21,6 +23,9 @@ async fn a_robot_with_little_charge_is_sent_to_a_charger_before_any_task() {
     assert_eq!(seen.task("T1").epoch, 0);
     w.until_phase("T1", Phase::Succeeded).await;
     assert_eq!(w.r("r1").battery_permille, 900, "it was charged up to the area's threshold");
+    let (counter, _) = load::<RobotCounter>(&*w.store, "r1@1.0.0").await.expect("a store").expect("it worked");
+    assert!(counter.errands.path_mm > 0, "what an errand cost is known by itself");
+    assert_eq!((counter.succeeded, counter.stats.path_mm), (1, counter.errands.path_mm + 1_000));
     w.lawful().await;
 }
 

@@ -198,6 +198,7 @@ async fn an_incident_is_shown_and_closed_where_what_it_is_about_is() {
         succeeded: 1,
         failures: Default::default(),
         stats: Default::default(),
+        errands: Default::default(),
         attached_ms: 1,
         counted: Default::default(),
     };

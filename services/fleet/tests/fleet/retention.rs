@@ -112,6 +112,7 @@ async fn of_a_robot_the_newest_counter_stays_and_older_ones_go_after_a_month() {
         succeeded: 1,
         failures: Default::default(),
         stats: Default::default(),
+        errands: Default::default(),
         attached_ms: 1,
         counted: Utc(BEGIN.0 - days * DAY_MS),
     };
@@ -226,6 +227,7 @@ async fn day_of_work(w: &World, day: u64) {
         succeeded: 1,
         failures: Default::default(),
         stats: Default::default(),
+        errands: Default::default(),
         attached_ms: 1,
         counted: now,
     };

@@ -73,6 +73,8 @@ pub struct Judge {
     rollouts: BTreeMap<RolloutId, Pace>,
     /// The wave of each robot.
     waves: BTreeMap<RolloutId, BTreeMap<RobotId, u32>>,
+    /// Robots that were written off: out of work for good, as far as anybody knows, they count in no budget until they are heard.
+    written_off: BTreeMap<RolloutId, BTreeSet<RobotId>>,
     robots: BTreeMap<RobotId, Robot>,
     now: LinkTime,
     /// What is known was there when it began to look: nobody saw it begin.
@@ -104,6 +106,7 @@ impl Judge {
         self.on.clear();
         self.rollouts.clear();
         self.waves.clear();
+        self.written_off.clear();
         self.knows_all = false;
     }
 
@@ -153,6 +156,18 @@ impl Judge {
     /// A robot of a roll-out as it became.
     pub fn robot(&mut self, rollout_id: RolloutId, robot_id: RobotId, wave: u32) {
         self.waves.entry(rollout_id).or_default().insert(robot_id, wave);
+    }
+
+    /// A robot of a roll-out was written off.
+    pub fn write_off(&mut self, rollout_id: RolloutId, robot_id: RobotId) {
+        self.written_off.entry(rollout_id).or_default().insert(robot_id);
+    }
+
+    /// A robot of a roll-out counts, as all do that were not written off.
+    pub fn count(&mut self, rollout_id: &RolloutId, robot_id: &RobotId) {
+        if let Some(robots) = self.written_off.get_mut(rollout_id) {
+            robots.remove(robot_id);
+        }
     }
 
     /// A drain as it became.
@@ -212,10 +227,17 @@ impl Judge {
         is_heard && !robot.stuck.is_some_and(|at| self.is_lately(at))
     }
 
+    /// Its robot was written off in its roll-out.
+    fn is_written_off(&self, drain: &Drain) -> bool {
+        let of_it = drain.rollout_id.as_ref().and_then(|id| self.written_off.get(id));
+        of_it.is_some_and(|robots| robots.contains(&drain.robot_id))
+    }
+
     /// A robot that goes back from what was aborted waits for drains alone that end by themselves. An urgent one waits for nobody, and counts.
     fn area_allows(&mut self, drain: &Drain) {
         let Some(area_id) = &drain.area_id else { return };
-        let counts = |d: &&Drain| !drain.returns || d.drain_id == drain.drain_id || self.comes_back(&d.robot_id);
+        let waited_for = |d: &Drain| !self.is_written_off(d) && (!drain.returns || self.comes_back(&d.robot_id));
+        let counts = |d: &&Drain| d.drain_id == drain.drain_id || waited_for(d);
         let taken_here = self.on.values().filter(|d| d.area_id.as_ref() == Some(area_id));
         let out: BTreeSet<&RobotId> = taken_here.filter(counts).map(|d| &d.robot_id).collect();
         let may = self.may_be_out(area_id);
@@ -237,7 +259,8 @@ impl Judge {
         if !waits(drain) {
             return;
         }
-        let of_it = self.on.values().filter(|d| d.rollout_id == drain.rollout_id && waits(d));
+        let counts = |d: &&Drain| d.drain_id == drain.drain_id || !self.is_written_off(d);
+        let of_it = self.on.values().filter(|d| d.rollout_id == drain.rollout_id && waits(d)).filter(counts);
         let out: BTreeSet<&RobotId> = of_it.map(|d| &d.robot_id).collect();
         let mut sizes: BTreeMap<u32, usize> = BTreeMap::new();
         for wave in self.waves.get(id).into_iter().flat_map(BTreeMap::values) {

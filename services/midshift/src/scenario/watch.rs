@@ -155,6 +155,11 @@ impl Fold for Rows {
             }
             _ => {
                 if let Some(robot) = change.decode::<RolloutRobot>()? {
+                    if robot.counts() {
+                        judge.count(&robot.rollout_id, &robot.robot_id);
+                    } else {
+                        judge.write_off(robot.rollout_id.clone(), robot.robot_id.clone());
+                    }
                     judge.robot(robot.rollout_id, robot.robot_id, robot.wave);
                 }
             }

@@ -62,6 +62,22 @@ async fn several_begin_an_empty_folder_only_if_their_store_knows_no_bundle() {
 }
 
 #[tokio::test]
+async fn what_older_servers_made_of_files_is_taken_away_at_the_start_and_nothing_else_is() {
+    let dir = TempDir::new().expect("a folder");
+    let folder = dir.path().join("ota");
+    for path in ["encoded/ab", "content"] {
+        fs::create_dir_all(folder.join(path)).expect("made");
+    }
+    fs::write(folder.join("encoded/ab/patch"), "bytes").expect("written");
+    fs::write(folder.join("kept"), "by somebody").expect("written");
+    for _ in 0..2 {
+        drop(crate::fixture::service(&dir).await);
+        let is_there = ["encoded", "content", "kept"].map(|name| folder.join(name).exists());
+        assert_eq!(is_there, [false, true, true]);
+    }
+}
+
+#[tokio::test]
 async fn what_is_not_there_is_not_made_by_who_reads() {
     let dir = TempDir::new().expect("a folder");
     let folder = dir.path().join("volume");
@@ -112,6 +128,17 @@ async fn the_first_mends_before_others_come_and_each_has_a_number_of_its_own() {
         tokio::task::yield_now().await;
     };
     assert!(third.number > 2);
+}
+
+#[test]
+fn a_number_is_drawn_once_whatever_the_file_held_before() {
+    let dir = TempDir::new().expect("a folder");
+    let path = dir.path().join("in-use.lock");
+    for (before, drawn) in [("", 1), ("9", 10), ("99\n", 100), ("what nobody wrote, and longer than a number", 1)] {
+        fs::write(&path, before).expect("written");
+        let numbers = [(); 3].map(|()| super::next_number(&path).expect("drawn"));
+        assert_eq!(numbers, [drawn, drawn + 1, drawn + 2], "{before:?}");
+    }
 }
 
 #[tokio::test]

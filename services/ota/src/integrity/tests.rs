@@ -39,8 +39,11 @@ async fn a_file_that_was_damaged_is_not_handed_out_and_can_be_brought_again() {
     std::fs::write(&path, vec![0; content.len()]).expect("damaged");
     let refusal = opened.hatch.listed(file.digest).await.expect_err("it is damaged");
     assert_eq!(refusal.reason.code, Code::SoftwareNotFound);
-    assert_eq!(opened.hatch.take_damaged().into_iter().collect::<Vec<_>>(), [file.digest]);
-    assert!(opened.hatch.take_damaged().is_empty(), "it is told once");
+    let damaged = opened.hatch.damaged();
+    assert_eq!(damaged.iter().copied().collect::<Vec<_>>(), [file.digest]);
+    assert_eq!(opened.hatch.damaged(), damaged, "it is kept until somebody was told");
+    opened.hatch.told_damaged(&damaged);
+    assert!(opened.hatch.damaged().is_empty(), "it is told once");
     opened.content.append(file, 0, content.into()).await.expect("room");
     assert_eq!(opened.content.settle(file).await.expect("whole"), Held::Whole);
     assert_eq!(opened.hatch.listed(file.digest).await.expect("handed out"), file);

@@ -302,7 +302,8 @@ impl Loop {
         // Rows that another process committed from what it published are not undone.
         opened.repository.documents().look_if_possible().await;
         releases::take(&mut self.view, now, opened.repository.newest().as_deref(), &mut plan);
-        for digest in opened.hatch.take_damaged() {
+        let damaged = opened.hatch.damaged();
+        for digest in &damaged {
             tell_damaged(&mut self.view, now, &digest.to_string(), &mut plan);
         }
         let replies = self.take_requests(requests, now, &mut plan);
@@ -325,6 +326,7 @@ impl Loop {
             tracing::error!(text, "roll-outs passed over something they cannot read");
         }
         self.renew_and_commit(renewal, now, plan, replies).await?;
+        opened.hatch.told_damaged(&damaged);
         self.answer(now);
         if let Some(seq) = foreign {
             self.changed.send_replace(seq);

@@ -1,7 +1,8 @@
 //! A process that does not lead: it keeps its picture by rows alone, answers from it, and carries out what people ask.
 //!
-//! Invariant: it decides nothing but commands, and signs nothing. Each is decided on the picture, committed on the condition that nothing of it
-//! has changed, and decided anew if something has; the process that leads obeys what is written.
+//! Invariant: it decides nothing but commands, tells nothing but that a file which it was to hand out is damaged, and signs nothing. A command is
+//! decided on the picture, committed on the condition that nothing of it has changed, and decided anew if something has; the process that leads
+//! obeys what is written.
 
 use super::Request;
 use super::reconcile::Loop;
@@ -9,7 +10,7 @@ use midshift_core::limits;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::commands::{self, Ask, Taken};
-use midshift_core::rollout::{LOGS, Plan, follow_rows, reread};
+use midshift_core::rollout::{LOGS, Plan, follow_rows, reread, tell_damaged};
 use midshift_core::rows::{Entry, Log, Table};
 use midshift_store::{CommitError, Error, follow};
 use std::sync::Arc;
@@ -64,8 +65,27 @@ impl Loop {
             }
         }
         trusted?;
+        self.tell_damaged().await;
         self.answer(self.parts.clock.now());
         Ok(())
+    }
+
+    /// Tells people of files that were found damaged here: the process that leads may never read them.
+    async fn tell_damaged(&mut self) {
+        let ota = self.parts.ota.clone();
+        let damaged = ota.opened().map(|opened| opened.hatch.damaged()).unwrap_or_default();
+        if damaged.is_empty() {
+            return;
+        }
+        let (now, mut plan) = (self.parts.clock.now(), Plan::default());
+        for digest in &damaged {
+            tell_damaged(&mut self.view, now, &digest.to_string(), &mut plan);
+        }
+        let results = self.parts.store.commit(plan.items).await;
+        match (results.into_iter().find_map(Result::err), ota.opened()) {
+            (None, Ok(opened)) => opened.hatch.told_damaged(&damaged),
+            (error, _) => tracing::warn!(?error, "people were not told of a damaged file; it is tried again"),
+        }
     }
 
     /// The answer to whoever asked. An error: what came of it may not be in the picture.

@@ -73,6 +73,24 @@ fn each_area_has_a_budget_of_its_own() {
 }
 
 #[test]
+fn a_robot_that_was_written_off_spends_no_budget_until_it_counts_again() {
+    let mut judge = judge();
+    judge.rollout(rollout(), Pace { max_in_flight: Some(2), ..Pace::default() });
+    (0..2).for_each(|number| judge.drain(drain(number, "hall")));
+    judge.write_off(rollout(), robot(0));
+    judge.drain(drain(2, "hall"));
+    assert_eq!(judge.take().broken, Vec::<String>::new());
+    judge.count(&rollout(), &robot(0));
+    judge.drain(drain(3, "hall"));
+    let names = "(r-00, r-01, r-02, r-03)";
+    let told = [
+        format!("hall: 4 robots were out of work {names}, 2 may be"),
+        format!("4 robots were out of work for it at once {names}, 2 may be"),
+    ];
+    assert_eq!(judge.take().broken, told);
+}
+
+#[test]
 fn one_area_may_not_spend_the_budget_of_another() {
     // Three may be out over the whole site.
     for (numbers, from, told) in [

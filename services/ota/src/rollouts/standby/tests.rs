@@ -1,5 +1,6 @@
 //! Two processes of the rollout service over one store and one folder: one plans and signs, the other carries out what people ask.
 
+mod damage;
 mod moves;
 mod past;
 mod reach;

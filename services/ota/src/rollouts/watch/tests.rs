@@ -135,6 +135,7 @@ impl Rig {
             succeeded,
             failures: BTreeMap::new(),
             stats: WorkStats::default(),
+            errands: WorkStats::default(),
             attached_ms: 0,
             counted: Utc(0),
         })]);
