@@ -3,6 +3,7 @@
 mod building;
 mod directives;
 mod fresh;
+mod kept;
 mod key_sets;
 mod keyring;
 mod metadata;
