@@ -643,6 +643,9 @@ impl AgentCore {
         }
         let commit = self.update.desired.as_ref().is_some_and(|d| d.goal == Goal::Commit && self.is_the_newest(d));
         if commit {
+            let mut switch = holdings.switch.clone();
+            switch.commit();
+            self.intend(&switch);
             return self.put_update(Update { state: UpdateState::Committing, ..update });
         }
         self.prove(holdings);

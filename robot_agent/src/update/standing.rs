@@ -147,12 +147,17 @@ impl AgentCore {
         self.put_proven(proven);
     }
 
-    /// Writes the switch record, after the ledger has what it will say of committed sets.
-    pub(super) fn write_switch(&mut self, switch: Switch) {
-        let (proven, meant) = (self.proven(), Committed::of(&switch));
+    /// Writes down what the switch record is about to say of committed sets.
+    pub(super) fn intend(&mut self, switch: &Switch) {
+        let (proven, meant) = (self.proven(), Committed::of(switch));
         if proven.committed != meant {
             self.put_proven(Proven { intended: Some(meant), ..proven });
         }
+    }
+
+    /// Writes the switch record, after the ledger has what it will say.
+    pub(super) fn write_switch(&mut self, switch: Switch) {
+        self.intend(&switch);
         self.ask_for(Job::Write(switch));
     }
 
