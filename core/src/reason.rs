@@ -367,6 +367,7 @@ codes! {
     LostServer = "LOST_SERVER", "With the new software the robot did not reach its server for ten minutes.";
     RevertAsked = "REVERT_ASKED", "The server asked the robot to go back.";
     NothingKept = "NOTHING_KEPT", "There is no set to go back to. A person must look.";
+    RunningSetBad = "RUNNING_SET_BAD", "What the robot runs is not what was signed and committed: a file, a manifest or the record of what runs was changed on its disk. It takes no work, and has the bytes anew or goes back by itself; if it is stuck, a person must look at the machine.";
     KeptSetBad = "KEPT_SET_BAD", "The kept set is not whole. A person must look.";
     UnknownWaypoint = "UNKNOWN_WAYPOINT", "The robot's map has no such waypoint.";
     UnsupportedAction = "UNSUPPORTED_ACTION", "The robot's body cannot do this action.";

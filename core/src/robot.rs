@@ -139,6 +139,8 @@ pub const FAULT_GRIPPER_MISSED: u32 = 1002;
 pub const FAULT_JAM: u32 = 2001;
 /// The agent's own clock ended the attempt.
 pub const FAULT_TIMEOUT: u32 = 1003;
+/// What the robot runs is not what was signed and committed: said by the agent, not by the maker.
+pub const FAULT_SOFTWARE: u32 = 9001;
 /// The work names what the body or map does not have.
 pub const FAULT_SEMANTIC: u32 = 4001;
 

@@ -256,6 +256,10 @@ impl Trusted {
     pub fn knowing(self, own_time: Utc) -> Self {
         Self { own_time, ..self }
     }
+    /// The newest root and the newest list of targets, as they were signed; none: the repository was never asked.
+    pub fn documents(&self) -> Option<(&str, &str)> {
+        Some((&self.root, self.targets.as_deref()?))
+    }
     /// It is at least this late.
     pub fn time_floor(&self) -> Utc {
         self.time_floor

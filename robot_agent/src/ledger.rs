@@ -6,6 +6,7 @@
 use crate::device::DeviceKey;
 use crate::store::Op;
 use crate::update::SoftwareRow;
+use crate::update::proven::Proven;
 use midshift_bundle::trust::Trusted;
 use midshift_core::identity::SessionSecret;
 use midshift_core::ids::{AttemptId, DrainId, PlaceId, Subject};
@@ -117,6 +118,8 @@ pub struct Ledger {
     pub software: SoftwareRow,
     /// What is believed of the repository.
     pub trusted: Option<Arc<Trusted>>,
+    /// What may run, and why; none: no agent that keeps documents has changed its software.
+    pub proven: Option<Arc<Proven>>,
     /// The key of this machine; none before its first start.
     pub device: Option<DeviceKey>,
     /// Ended attempts that the server has not yet said it stored.
@@ -176,6 +179,7 @@ impl Ledger {
             Op::Maintenance(drain_id) => self.maintenance.clone_from(drain_id),
             Op::Software(row) => self.software = SoftwareRow::clone(row),
             Op::Trusted(trusted) => self.trusted = Some(trusted.clone()),
+            Op::Proven(proven) => self.proven = Some(proven.clone()),
             Op::Device(key) => self.device = Some(key.clone()),
             Op::Epoch(subject, epoch, at_unix_ms) => {
                 let old = self.subjects.get(subject);

@@ -164,6 +164,9 @@ impl AgentCore {
         if self.kept.ledger.maintenance.is_some() || self.changes_software() {
             return self.refuse(now, &assignment, Code::InMaintenance.into());
         }
+        if let Some(reason) = self.software_refusal() {
+            return self.refuse(now, &assignment, reason);
+        }
         if let Some(fault) = &self.unfit {
             let why = Reason::from(Code::RobotFault).with("fault_code", fault.code);
             return self.refuse(now, &assignment, why);

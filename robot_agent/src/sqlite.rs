@@ -91,6 +91,7 @@ impl SqliteStore {
                 "maintenance" => ledger.maintenance = read(&key, &value)?,
                 "software" => ledger.software = read(&key, &value)?,
                 "trusted" => ledger.trusted = Some(Arc::new(read(&key, &value)?)),
+                "proven" => ledger.proven = Some(Arc::new(read(&key, &value)?)),
                 "device" => ledger.device = Some(read(&key, &value)?),
                 // A newer version's.
                 _ => {}
@@ -185,6 +186,7 @@ async fn write(on: &mut SqliteConnection, op: &Op) -> Result<(), Error> {
         Op::Maintenance(drain_id) => fact(on, "maintenance", drain_id).await,
         Op::Software(row) => fact(on, "software", row).await,
         Op::Trusted(trusted) => fact(on, "trusted", trusted.as_ref()).await,
+        Op::Proven(proven) => fact(on, "proven", proven.as_ref()).await,
         Op::Device(key) => fact(on, "device", key).await,
         Op::Epoch(subject, epoch, at_unix_ms) => {
             let upsert = "INSERT INTO subject (subject, epoch, at_unix_ms) VALUES ($1, $2, $3)

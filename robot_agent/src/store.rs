@@ -8,6 +8,7 @@ use crate::device::DeviceKey;
 use crate::ledger::{Applied, Holder, Ledger, PlacesRow, SessionMemory};
 use crate::ring::Ring;
 use crate::update::SoftwareRow;
+use crate::update::proven::Proven;
 use async_trait::async_trait;
 use midshift_bundle::trust::Trusted;
 use midshift_core::ids::{AttemptId, DrainId, Subject};
@@ -63,6 +64,8 @@ pub enum Op {
     Software(Box<SoftwareRow>),
     /// What is believed of the repository.
     Trusted(Arc<Trusted>),
+    /// What may run, and why.
+    Proven(Arc<Proven>),
     /// The key of this machine: once, at its first start.
     Device(DeviceKey),
     /// This epoch of the subject was seen, at this wall time (unix milliseconds): it is passed.

@@ -130,7 +130,8 @@ impl AgentCore {
         if self.mode != Mode::Automatic || self.hardware_stop != HardwareStop::None || self.is_stopped() {
             return Pause::Now;
         }
-        if self.is_held() || self.suspends() || !self.has_lease(now) { Pause::WindDown } else { Pause::No }
+        let waits = self.is_held() || self.suspends() || !self.has_lease(now) || !self.runs_what_was_signed();
+        if waits { Pause::WindDown } else { Pause::No }
     }
 
     /// It is asked to hand its attempt back at a step boundary, and it may: it carries nothing and is not inside an action.

@@ -4,6 +4,7 @@ mod building;
 mod by_hand;
 mod directives;
 mod fresh;
+mod kept;
 mod key_sets;
 mod keyring;
 mod metadata;

@@ -21,7 +21,7 @@ use crate::starts::TRIES_MAX;
 use crate::switch::Switch;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base};
-use midshift_bundle::manifest::{COMPONENT_BYTES_MAX, MANIFEST_BYTES_MAX};
+use midshift_bundle::manifest::{COMPONENT_BYTES_MAX, Component, ComponentKind, MANIFEST_BYTES_MAX};
 use midshift_bundle::set::SetManifest;
 use midshift_durable::record;
 use std::collections::{BTreeMap, BTreeSet};
@@ -182,14 +182,40 @@ impl DiskSets {
         let set = self.sets()?.remove(id).ok_or(Error::Missing(*id))?;
         let program = set.program().map(|program| (PROGRAM.to_owned(), program));
         for (name, component) in set.components.iter().map(|(name, c)| (name.clone(), c)).chain(program) {
-            let file = optional(File::open(folder.join(name))).map_err(io_error("reading a set"))?;
-            let mut file = file.ok_or(Error::Missing(component.digest))?;
-            let read = Digest::of_reader(&mut file, COMPONENT_BYTES_MAX).map_err(io_error("reading a set"))?;
-            if read != (component.digest, component.length) {
-                return Err(Error::Corrupt { digest: component.digest });
-            }
+            verify_file(&folder.join(name), component)?;
         }
         Ok(set)
+    }
+
+    /// Links all of a set into its folder, in place of what lies there; its page comes last.
+    fn link_anew(&self, set: &SetManifest, folder: &Path) -> io::Result<()> {
+        midshift_durable::make_folder(folder)?;
+        let link = |digest: &Digest, name: &str| {
+            let beside = folder.join(format!("{name}.new"));
+            remove(&beside)?;
+            fs::hard_link(self.content(digest), &beside)?;
+            midshift_durable::rename(&beside, &folder.join(name))?;
+            // Two names of one file: nothing was renamed.
+            remove(&beside)
+        };
+        for component in set.components.values() {
+            link(&component.digest, &component.name)?;
+        }
+        if let Some(program) = set.program() {
+            self.make_callable(&program.digest)?;
+            link(&program.digest, PROGRAM)?;
+        }
+        if set.base().is_some() {
+            midshift_durable::replace(&folder.join(BASE), base_name(set).as_bytes())?;
+        }
+        midshift_durable::replace(&folder.join(SET_FILE), &set.to_bytes())
+    }
+
+    /// A program that lost its mode with the power could not be started.
+    fn make_callable(&self, program: &Digest) -> io::Result<()> {
+        let content = self.content(program);
+        fs::set_permissions(&content, Permissions::from_mode(0o755))?;
+        midshift_durable::sync_file(&content)
     }
 
     /// Links all of a set into a folder beside and gives it its name.
@@ -203,11 +229,8 @@ impl DiskSets {
             fs::hard_link(self.content(&component.digest), beside.join(&component.name))?;
         }
         if let Some(program) = set.program() {
-            let content = self.content(&program.digest);
-            // A program that lost its mode with the power could not be started.
-            fs::set_permissions(&content, Permissions::from_mode(0o755))?;
-            midshift_durable::sync_file(&content)?;
-            fs::hard_link(content, beside.join(PROGRAM))?;
+            self.make_callable(&program.digest)?;
+            fs::hard_link(self.content(&program.digest), beside.join(PROGRAM))?;
         }
         if set.base().is_some() {
             midshift_durable::write(&beside.join(BASE), base_name(set).as_bytes())?;
@@ -216,6 +239,18 @@ impl DiskSets {
         midshift_durable::sync_folder(&beside)?;
         midshift_durable::rename(&beside, folder)
     }
+}
+
+/// Reads a file that is to have the bytes of a component.
+fn verify_file(path: &Path, component: &Component) -> Result<(), Error> {
+    let file = optional(File::open(path)).map_err(io_error("reading a set"))?;
+    let mut file = file.ok_or(Error::Missing(component.digest))?;
+    let read = match Digest::of_reader(&mut file, COMPONENT_BYTES_MAX) {
+        Err(error) if error.kind() != io::ErrorKind::InvalidData => return Err(io_error("reading a set")(error)),
+        read => read.ok(),
+    };
+    let is_right = read == Some((component.digest, component.length));
+    if is_right { Ok(()) } else { Err(Error::Corrupt { digest: component.digest }) }
 }
 
 /// Deletes the folder of a set. Its page goes first and for good: without it the folder is no set, whatever else of it is left.
@@ -309,6 +344,34 @@ impl Sets for DiskSets {
     fn verify(&mut self, id: &Digest) -> Result<(), Error> {
         let set = self.verify_files(id)?;
         self.verify_base(&set)
+    }
+
+    fn check(&mut self, id: &Digest, file: &str) -> Result<(), Error> {
+        let set = self.sets()?.remove(id).ok_or(Error::Missing(*id))?;
+        let component = if file == PROGRAM { set.program() } else { set.components.get(file) };
+        let component = component.ok_or(Error::Missing(*id))?;
+        verify_file(&self.folder.join(id.to_string()).join(file), component)?;
+        if component.kind == ComponentKind::Base { self.verify_base(&set) } else { Ok(()) }
+    }
+
+    fn discard(&mut self, wanted: &Wanted) -> Result<(), Error> {
+        let read = |path: &Path| Digest::of_reader(&mut File::open(path)?, COMPONENT_BYTES_MAX);
+        let path = self.content(&wanted.digest);
+        let read = match read(&path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+            Err(error) if error.kind() == io::ErrorKind::InvalidData => None,
+            read => Some(read.map_err(io_error("reading content"))?),
+        };
+        if read == Some((wanted.digest, wanted.length)) {
+            return Ok(());
+        }
+        midshift_durable::remove(&path).map(drop).map_err(io_error("throwing content away"))
+    }
+
+    fn mend(&mut self, set: &SetManifest) -> Result<(), Error> {
+        let id = set.id();
+        self.link_anew(set, &self.folder.join(id.to_string())).map_err(io_error("mending a set"))?;
+        self.verify(&id)
     }
 
     fn program(&mut self, set: &Digest) -> Option<PathBuf> {

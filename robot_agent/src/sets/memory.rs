@@ -5,9 +5,11 @@
 use super::content::Bitmap;
 use super::{Error, Holdings, Sets, Wanted, base_name};
 use crate::boot::{Boot, Image};
+use crate::launcher::PROGRAM;
 use crate::switch::{FACTORY, Switch};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base};
+use midshift_bundle::manifest::ComponentKind;
 use midshift_bundle::set::SetManifest;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Cursor};
@@ -59,6 +61,10 @@ impl MemorySets {
         if let Some(byte) = self.state().content.get_mut(digest).and_then(|bytes| bytes.first_mut()) {
             *byte ^= 1;
         }
+    }
+    /// The page of a set is not what its name says any more.
+    pub fn lose_page(&self, set: &Digest) {
+        self.state().sets.remove(set);
     }
     /// What a launcher does with a set that does not live.
     pub fn fall_back(&self, tries: u32) {
@@ -251,6 +257,30 @@ impl Sets for MemorySets {
     fn verify(&mut self, id: &Digest) -> Result<(), Error> {
         let state = self.state();
         state.verify(state.sets.get(id).ok_or(Error::Missing(*id))?)
+    }
+
+    fn check(&mut self, id: &Digest, file: &str) -> Result<(), Error> {
+        let state = self.state();
+        let set = state.sets.get(id).ok_or(Error::Missing(*id))?;
+        let component = if file == PROGRAM { set.program() } else { set.components.get(file) };
+        let component = component.ok_or(Error::Missing(*id))?;
+        let bytes = state.content.get(&component.digest).ok_or(Error::Missing(component.digest))?;
+        if Digest::of(bytes) != component.digest {
+            return Err(Error::Corrupt { digest: component.digest });
+        }
+        if component.kind == ComponentKind::Base { state.verify_base(set) } else { Ok(()) }
+    }
+
+    fn discard(&mut self, wanted: &Wanted) -> Result<(), Error> {
+        self.state().content.retain(|digest, bytes| *digest != wanted.digest || Digest::of(bytes) == *digest);
+        Ok(())
+    }
+
+    fn mend(&mut self, set: &SetManifest) -> Result<(), Error> {
+        let mut state = self.state();
+        state.verify(set)?;
+        state.sets.insert(set.id(), set.clone());
+        Ok(())
     }
 
     fn program(&mut self, _: &Digest) -> Option<PathBuf> {

@@ -169,6 +169,22 @@ pub trait Sets: Send {
     /// # Errors
     /// What is missing or wrong.
     fn verify(&mut self, id: &Digest) -> Result<(), Error>;
+    /// Reads one file of a set again: a component by its name, with the base where the machine starts it from, or
+    /// [`crate::launcher::PROGRAM`].
+    ///
+    /// # Errors
+    /// If it is missing or wrong.
+    fn check(&mut self, set: &Digest, file: &str) -> Result<(), Error>;
+    /// Throws content away that has other bytes than it should. Nothing to do if it is right, or not there.
+    ///
+    /// # Errors
+    /// The disk's.
+    fn discard(&mut self, wanted: &Wanted) -> Result<(), Error>;
+    /// Puts the page of a set and its files in place of what lies there, one by one, of content that is there, and reads it back.
+    ///
+    /// # Errors
+    /// Content that is missing; what cannot be mended so, as a base; the disk's.
+    fn mend(&mut self, set: &SetManifest) -> Result<(), Error>;
     /// The program of a set as it can be called; none: these sets are of robots in memory, which run no programs and have no data.
     fn program(&mut self, set: &Digest) -> Option<PathBuf>;
     /// Replaces the switch record. The base of a set that it makes current becomes good.

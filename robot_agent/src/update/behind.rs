@@ -2,7 +2,7 @@
 //!
 //! Invariant: a set that the ledger has committed is not gone back from for that: floors have risen with it. Called by the machine.
 
-use super::{Job, Update};
+use super::Update;
 use crate::core::AgentCore;
 use crate::switch::Switch;
 use midshift_core::reason::{Code, Reason};
@@ -23,7 +23,7 @@ impl AgentCore {
             switch.go_back();
             self.update.went_back = true;
         }
-        self.ask_for(Job::Write(switch));
+        self.write_switch(switch);
         true
     }
 

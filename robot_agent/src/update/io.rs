@@ -10,6 +10,7 @@ use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{ENCODED_BYTES_MAX, ENCODED_BYTES_MIN};
 use midshift_bundle::key_set::{self, KeySet};
 use midshift_bundle::manifest::{MANIFEST_BYTES_MAX, Manifest};
+use midshift_bundle::set::SetManifest;
 use midshift_bundle::trust::{self, Listed, Reading, Refreshed, Source, Trusted};
 use midshift_core::reason::{Code, Reason};
 use std::collections::BTreeMap;
@@ -143,6 +144,8 @@ impl Worker for UpdateWorker {
             },
             Job::Stage(set) => self.done(move |sets| sets.stage(&set)).await,
             Job::Verify(set) => self.verify(set.as_str()).await,
+            Job::Check { set, file } => self.held(move |sets| sets.check(&set, &file)).await,
+            Job::Mend(set) => self.mend(*set, &leave).await,
             Job::Write(mut switch) => self
                 .on_disk(move |sets| sets.write_switch(&mut switch).map(|()| Done::Written(switch)))
                 .await
@@ -232,10 +235,33 @@ impl UpdateWorker {
         }
     }
 
+    /// Reads what runs: other bytes than were signed are no trouble that passes.
+    async fn held(&self, verb: impl FnOnce(&mut dyn Sets) -> Result<(), sets::Error> + Send + 'static) -> Done {
+        match self.on_disk(verb).await {
+            Ok(()) => Done::Ok,
+            Err(error @ sets::Error::Io { .. }) => later(error),
+            Err(error) => refused(Reason::new(Code::RunningSetBad, error.to_string())),
+        }
+    }
+
+    /// Has all of a set's bytes anew that are not what was signed, and puts them in place.
+    async fn mend(&self, set: SetManifest, leave: &CancellationToken) -> Done {
+        for component in set.components.values() {
+            let wanted = Wanted { digest: component.digest, length: component.length };
+            if let Err(error) = self.on_disk(move |sets| sets.discard(&wanted)).await {
+                return Done::Failed(of_disk(&error));
+            }
+            if let Err(failed) = self.fetch_whole(wanted, &mut Pace::new(0), leave).await {
+                return ended(Err(failed));
+            }
+        }
+        self.held(move |sets| sets.mend(&set)).await
+    }
+
     async fn manifest(&self, wanted: Wanted) -> Done {
         match self.on_disk(move |sets| sets.read(&wanted.digest, MANIFEST_BYTES_MAX as u64)).await {
             Ok(bytes) => match Manifest::from_bytes(&bytes) {
-                Ok(manifest) => Done::Manifest(Box::new(manifest)),
+                Ok(manifest) => Done::Manifest { manifest: Box::new(manifest), bytes },
                 Err(refusal) => refused(Reason::new(Code::BundleUnfit, refusal.reason.text())),
             },
             Err(error) => later(error),

@@ -1,7 +1,10 @@
 //! The robot's updater without IO: which bytes to fetch, when to switch, when to go back.
 //!
-//! Rooms: here what it knows and asks for; `pursue` is the machine; `believes` is what it holds directives against; `migrate` is what follows a commit; `io` does the jobs; `remote` asks the server;
-//! `again` says how long is waited for what failed; `behind` mends a switch record that is older than the ledger. Called by the core.
+//! Rooms: here what it knows and asks for; `pursue` is the machine; `believes` is what it holds directives against; `standing` holds what runs
+//! against what was signed and committed, and `proven` is what the ledger keeps for that; `way_back` takes orders that lead
+//! back from the committed set; `migrate` is what follows a commit; `io` does the jobs; `remote` asks the server;
+//! `again` says how long is waited for what failed; `behind` mends a switch record that is older than the ledger. Called
+//! by the core.
 //! Invariant: each side effect is a [`Job`], and a job begins only after the ledger row that explains it is durable; at most one job is
 //! under way. The switch record wins over the ledger, unless it has on trial what the ledger has committed.
 
@@ -10,8 +13,11 @@ mod behind;
 mod believes;
 pub mod io;
 pub mod migrate;
+pub mod proven;
 mod pursue;
 pub mod remote;
+mod standing;
+mod way_back;
 
 use crate::core::AgentCore;
 use crate::sets::{Holdings, Wanted};
@@ -28,6 +34,7 @@ use midshift_core::time::{LinkTime, SiteTime, Utc};
 use midshift_core::update::{DesiredUpdate, UpdateReport, UpdateState};
 use migrate::DueMigration;
 use serde::{Deserialize, Serialize};
+use standing::Standing;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -163,6 +170,15 @@ pub enum Job {
     Stage(Box<SetManifest>),
     /// Read a set again.
     Verify(SetId),
+    /// Read one file of a set again.
+    Check {
+        /// The set.
+        set: Digest,
+        /// Name of a component, or of the program as the launcher calls it.
+        file: String,
+    },
+    /// Have every file of a set as it was signed: what lies there otherwise comes anew.
+    Mend(Box<SetManifest>),
     /// Write the switch record.
     Write(Switch),
     /// Have a committed set do something to the robot's data.
@@ -186,6 +202,8 @@ impl Job {
             Self::Manifest { .. } => "manifest",
             Self::Stage(_) => "stage",
             Self::Verify(_) => "verify",
+            Self::Check { .. } => "check",
+            Self::Mend(_) => "mend",
             Self::Write(_) => "write",
             Self::Migrate { .. } => "migrate",
             Self::Collect(_) => "collect",
@@ -213,7 +231,12 @@ pub enum Done {
         failure: Failure,
     },
     /// A manifest.
-    Manifest(Box<Manifest>),
+    Manifest {
+        /// As it was read.
+        manifest: Box<Manifest>,
+        /// As it was signed.
+        bytes: Vec<u8>,
+    },
     /// Done as asked.
     Ok,
     /// Written, with its number.
@@ -285,11 +308,20 @@ pub(crate) struct Updater {
     pub(crate) collected: bool,
     /// When the disk was looked at last without an update under way.
     pub(crate) looked: Option<LinkTime>,
+    /// Whether what runs is what was signed and committed.
+    pub(crate) standing: Standing,
+    /// When its files were last begun to be read.
+    pub(crate) read_at: Option<LinkTime>,
+    /// Those that are to be read still.
+    pub(crate) unread: Vec<String>,
+    /// The process ends once the switch record has a higher number than this.
+    pub(crate) leaves: Option<u64>,
 }
 
 impl AgentCore {
     /// What the shell saw on the disk before the start: to be told, nothing is decided on it.
     pub fn saw(&mut self, holdings: Option<Holdings>) {
+        self.holds_as_it_came(holdings.as_ref());
         self.update.seen = holdings;
     }
     /// What is on the disk, as it was seen last. None: its software is not changed, or the disk cannot be read.

@@ -2,14 +2,13 @@
 //!
 //! Invariant: level-triggered. It may be called at any moment and any number of times; what it decides is written down before it is done.
 
-use super::believes::refusal_of;
+use super::standing::Next;
 use super::{Done, Failure, Job, SoftwareRow, Update, again, io, migrate};
 use crate::core::{AgentCore, ExitReason, Output};
 use crate::sets::{Holdings, Wanted};
 use crate::store::Op;
 use crate::switch::Switch;
 use midshift_bundle::digest::Digest;
-use midshift_bundle::directive::Rejection;
 use midshift_bundle::manifest::{Manifest, Migration};
 use midshift_bundle::set::{Fit, SetManifest, raised};
 use midshift_core::ids::{DrainId, PlaceId, SetId};
@@ -83,26 +82,40 @@ impl AgentCore {
             self.ask_for(Job::Look);
             return None;
         };
+        match self.hold_running(now, &holdings) {
+            Next::GoesOn => {}
+            Next::Waits => return None,
+            Next::Ends(reason) => return Some(reason),
+        }
+        let ends = self.pursue(now, &holdings);
+        if ends.is_none() && self.update.next.is_none() {
+            self.check_files(now, &holdings);
+        }
+        ends
+    }
+
+    /// The next step of the update, or of the robot without one.
+    fn pursue(&mut self, now: &Now, holdings: &Holdings) -> Option<ExitReason> {
         let Some(update) = self.kept.ledger.software.update.clone() else {
-            return self.without_update(now, &holdings);
+            return self.without_update(now, holdings);
         };
         match update.state {
             UpdateState::Directed => self.directed(now, &update),
             UpdateState::Downloading => self.downloading(&update),
             UpdateState::Staged => self.staged(now, update),
-            UpdateState::Switching => return self.switching(now, &update, &holdings),
-            UpdateState::Probation => self.probation(now, update, &holdings),
-            UpdateState::Trial => self.trial(update, &holdings),
-            UpdateState::Committing => self.committing(now, update, &holdings),
-            UpdateState::RollingBack => return self.rolling_back(now, update, &holdings),
+            UpdateState::Switching => return self.switching(now, &update, holdings),
+            UpdateState::Probation => self.probation(now, update, holdings),
+            UpdateState::Trial => self.trial(update, holdings),
+            UpdateState::Committing => self.committing(now, update, holdings),
+            UpdateState::RollingBack => return self.rolling_back(now, update, holdings),
             UpdateState::Committed if self.wants_back(&update) => {
                 if holdings.switch.kept().is_none() {
                     self.refuse_way_back();
-                    return self.without_update(now, &holdings);
+                    return self.without_update(now, holdings);
                 }
                 self.go_back(update, Reason::from(Code::RevertAsked));
             }
-            _ => return self.without_update(now, &holdings),
+            _ => return self.without_update(now, holdings),
         }
         None
     }
@@ -129,7 +142,9 @@ impl AgentCore {
             (Job::Refresh { .. }, Done::Refreshed { refreshed, key_sets }) => {
                 self.refreshed(now, *refreshed, &key_sets)
             }
-            (Job::Manifest { wanted }, Done::Manifest(manifest)) => self.plan(now, &wanted, &manifest),
+            (Job::Manifest { wanted }, Done::Manifest { manifest, bytes }) => {
+                self.plan(now, &wanted, &manifest, &bytes)
+            }
             (Job::Fetch { wanted, .. }, Done::Ok) => {
                 self.update.fetched.insert(wanted.digest);
             }
@@ -144,7 +159,14 @@ impl AgentCore {
                 }
                 self.move_to(UpdateState::Staged, None);
             }
-            (Job::Write(_), Done::Written(switch)) => self.hold(|holdings| holdings.switch = switch),
+            (Job::Write(_), Done::Written(switch)) => {
+                self.hold(|holdings| holdings.switch = switch);
+                if let Some(holdings) = self.update.holdings.clone() {
+                    self.note_committed(&holdings);
+                }
+            }
+            (Job::Check { file, .. }, Done::Ok) => self.checked(&file),
+            (Job::Mend(_), Done::Ok) => self.mended(),
             (Job::Verify(set), Done::Ok) => self.verified(&set),
             (Job::Migrate { due, .. }, Done::Ok) => self.migrated(&due),
             (Job::Collect(_), Done::Ok) => {
@@ -177,6 +199,9 @@ impl AgentCore {
         if let Job::Migrate { due, .. } = job {
             self.not_migrated(due, why);
         }
+        if matches!(job, Job::Mend(_)) {
+            self.not_mended();
+        }
         if matches!(job, Job::Stage(_)) {
             // Content that was there has changed on the disk: look for all of it again.
             self.update.fetched.clear();
@@ -186,6 +211,8 @@ impl AgentCore {
     fn job_refused(&mut self, now: &Now, job: Job, reason: Reason) {
         match job {
             Job::Verify(_) => self.move_to(UpdateState::Stuck, Some(reason)),
+            Job::Check { .. } => self.condemn(reason),
+            Job::Mend(_) => self.give_up_mending(),
             Job::Refresh { .. } => self.refuse_directive(reason),
             Job::Manifest { .. } | Job::Fetch { .. } | Job::Stage(_) => {
                 self.move_to(UpdateState::Refused, Some(reason))
@@ -197,6 +224,7 @@ impl AgentCore {
     // --- the row
 
     pub(super) fn put_software(&mut self, row: SoftwareRow) {
+        self.note_directive(row.directive);
         self.write(Op::Software(Box::new(row)), true);
     }
 
@@ -244,7 +272,8 @@ impl AgentCore {
         if self.begin_way_back(now, holdings) || self.begin_update(now) || (!is_stuck && self.migrate(holdings)) {
             return None;
         }
-        if !self.update.collected {
+        // Nothing is deleted while record and ledger do not agree on what was committed.
+        if !self.update.collected && self.runs_what_was_signed() {
             self.ask_for(Job::Collect(self.needed()));
         } else if now.link.since(*self.update.looked.get_or_insert(now.link)) >= LOOK_EVERY {
             self.update.looked = Some(now.link);
@@ -283,76 +312,6 @@ impl AgentCore {
         }
     }
 
-    /// Looks at a directive that leads back from the committed set though something else was tried and left since. True: it was taken.
-    fn begin_way_back(&mut self, now: &Now, holdings: &Holdings) -> bool {
-        let Some(desired) = self.update.desired.clone().filter(|d| d.goal == Goal::Revert) else { return false };
-        if self.is_observed() || self.names(&desired) {
-            return false;
-        }
-        let update = self.kept.ledger.software.update.clone();
-        let stuck = update.filter(|update| update.state == UpdateState::Stuck);
-        let is_back = stuck.as_ref().and_then(Update::set_name).is_some_and(|set| set != holdings.switch.running());
-        if holdings.switch.kept().is_none() && !is_back {
-            self.refuse_way_back();
-            return false;
-        }
-        let trusted = match self.trusted() {
-            Ok(trusted) => trusted,
-            Err(reason) => {
-                self.refuse_directive(reason);
-                return false;
-            }
-        };
-        let software = self.kept.ledger.software.clone();
-        let opened = self.opened(&desired, software.directive, trusted.now(self.reading(now)));
-        if opened == Err(Rejection::NotSigned) && self.update.keys_asked.as_ref() != Some(&desired.directive) {
-            // The server may sign with a key that came since.
-            self.ask_to_refresh(now, trusted, self.reading(now));
-            self.update.asks_for_keys = true;
-            return true;
-        }
-        let directive = match opened {
-            Ok(directive) => directive,
-            Err(rejection) => {
-                self.refuse_directive(refusal_of(&rejection));
-                return false;
-            }
-        };
-        if let Some(update) = stuck.filter(|update| update.bundle == directive.manifest) {
-            // A person mended what kept it: it is gone back from once more.
-            self.update.judged = Some(desired.directive.clone());
-            self.put_software(software.with(&directive, &desired));
-            let (state, reason) = (UpdateState::RollingBack, Some(Reason::from(Code::RevertAsked)));
-            let drain_id = desired.drain_id.or(update.drain_id);
-            self.put_update(Update { state, drain_id, reason, ..update });
-            return true;
-        }
-        let committed = holdings.set(&holdings.switch.current).filter(|_| holdings.switch.trial.is_none());
-        let Some(set) = committed.filter(|set| set.bundle == Some(directive.manifest)) else {
-            self.refuse_directive(Reason::new(Code::DirectiveRefused, "another bundle is the committed one, or runs"));
-            return false;
-        };
-        let row = software.with(&directive, &desired);
-        self.update.judged = Some(desired.directive);
-        let is_irreversible = set.components.values().any(|c| c.data_migration == Migration::Irreversible);
-        let update = Update {
-            state: UpdateState::Committed,
-            bundle: directive.manifest,
-            manifest_length: directive.manifest_length,
-            rollback_floor: directive.rollback_floor,
-            set: Some(set),
-            raises_floor: false,
-            is_irreversible,
-            drain_id: desired.drain_id,
-            tries: 0,
-            probation_ms: desired.probation_ms,
-            reason: None,
-        };
-        self.put_software(row);
-        self.put_update(update);
-        true
-    }
-
     /// The newest directive is not taken; it is not looked at again.
     pub(super) fn refuse_directive(&mut self, reason: Reason) {
         let Some(desired) = &self.update.desired else { return };
@@ -360,15 +319,6 @@ impl AgentCore {
         self.update.judged = Some(desired.directive.clone());
         let refused = UpdateEvent::DirectiveRefused { generation: desired.generation, reason };
         self.emit(Lane::Event, RobotEvent::Update(refused));
-    }
-
-    /// There is nothing to go back to, which the server cannot know; it is told once.
-    fn refuse_way_back(&mut self) {
-        let asked = self.update.desired.as_ref().map(|d| d.generation);
-        if self.update.no_way_back != asked {
-            self.update.no_way_back = asked;
-            self.refuse_directive(Reason::from(Code::NothingKept));
-        }
     }
 
     // --- bytes
@@ -382,7 +332,7 @@ impl AgentCore {
     }
 
     /// What comes of the bundle on this robot, or why it does not fit.
-    fn plan(&mut self, now: &Now, wanted: &Wanted, manifest: &Manifest) {
+    fn plan(&mut self, now: &Now, wanted: &Wanted, manifest: &Manifest, bytes: &[u8]) {
         let Some(update) = self.kept.ledger.software.update.clone() else { return };
         let Some(holdings) = self.update.holdings.clone() else { return };
         let current = holdings.set(&holdings.switch.current).unwrap_or_default();
@@ -425,6 +375,9 @@ impl AgentCore {
         if needed > holdings.free_bytes {
             let reason =
                 Reason::from(Code::NoRoom).with("needed_bytes", needed).with("free_bytes", holdings.free_bytes);
+            return self.move_to(UpdateState::Refused, Some(reason));
+        }
+        if let Err(reason) = self.keep_release(bytes, &set) {
             return self.move_to(UpdateState::Refused, Some(reason));
         }
         let is_irreversible = manifest.components.iter().any(|c| c.data_migration == Migration::Irreversible);
@@ -470,7 +423,7 @@ impl AgentCore {
     }
 
     /// Whether the section's directive needs no look: it was looked at, or is the one that was taken last.
-    fn names(&self, desired: &DesiredUpdate) -> bool {
+    pub(super) fn names(&self, desired: &DesiredUpdate) -> bool {
         self.update.judged.as_ref() == Some(&desired.directive) || self.is_the_newest(desired)
     }
 
@@ -607,13 +560,14 @@ impl AgentCore {
         }
         let mut switch = holdings.switch.clone();
         switch.try_out(&name);
-        self.ask_for(Job::Write(switch));
+        self.write_switch(switch);
         None
     }
 
     /// What the disk says after a start, held against the ledger. The switch record wins.
     fn look(&mut self, holdings: Holdings) {
         let switch = holdings.switch.clone();
+        self.note_committed(&holdings);
         self.update.holdings = Some(holdings);
         let Some(update) = self.kept.ledger.software.update.clone() else { return };
         let Some(name) = update.set_name() else { return };
@@ -678,7 +632,7 @@ impl AgentCore {
         if holdings.switch.trial.as_ref().is_some_and(|t| !t.is_proven) {
             let mut switch = holdings.switch.clone();
             switch.prove();
-            self.ask_for(Job::Write(switch));
+            self.write_switch(switch);
         }
     }
 
@@ -688,6 +642,9 @@ impl AgentCore {
         }
         let commit = self.update.desired.as_ref().is_some_and(|d| d.goal == Goal::Commit && self.is_the_newest(d));
         if commit {
+            let mut switch = holdings.switch.clone();
+            switch.commit();
+            self.intend(&switch);
             return self.put_update(Update { state: UpdateState::Committing, ..update });
         }
         self.prove(holdings);
@@ -699,7 +656,7 @@ impl AgentCore {
         if holdings.switch.trial.as_ref().is_some_and(|trial| Some(&trial.set) == name.as_ref()) {
             let mut switch = holdings.switch.clone();
             switch.commit();
-            return self.ask_for(Job::Write(switch));
+            return self.write_switch(switch);
         }
         if holdings.switch.trial.is_some() || Some(&holdings.switch.current) != name.as_ref() {
             return self.move_to(UpdateState::RolledBack, Some(Reason::from(Code::SetPutAway)));
@@ -748,12 +705,16 @@ impl AgentCore {
         }
         // A task that is held or stopped does not keep the robot from going back; one that goes on does, until it is drained.
         let stopped = self.hardware_stop != HardwareStop::None || self.is_stopped();
-        let works = self.work.is_some() && !stopped && !self.resume_needed;
+        let works = self.work.is_some() && !stopped && !self.resume_needed && self.runs_what_was_signed();
         if works || !self.body.standstill(now.site) {
             return None;
         }
         let kept = holdings.switch.kept().and_then(|kept| SetId::parse(kept).ok());
         match kept {
+            Some(kept) if !self.is_proven(kept.as_str(), holdings) => {
+                let reason = Reason::new(Code::KeptSetBad, "its manifest is none that was signed and committed");
+                self.move_to(UpdateState::Stuck, Some(reason));
+            }
             Some(kept) => self.ask_for(Job::Verify(kept)),
             None => self.move_to(UpdateState::Stuck, Some(Reason::from(Code::NothingKept))),
         }
@@ -771,7 +732,7 @@ impl AgentCore {
         }
         if switch.running() == set.as_str() {
             self.update.went_back = true;
-            self.ask_for(Job::Write(switch));
+            self.write_switch(switch);
         }
     }
 }

@@ -25,6 +25,7 @@ mod restarts;
 mod rig;
 mod session;
 mod sets;
+mod signed;
 mod steps;
 mod stop_chaos;
 mod stop_cuts;

@@ -286,10 +286,10 @@ async fn a_release_comes_over_the_wire_whole() {
     let mut sets = MemorySets::new();
     let mut worker = UpdateWorker::new(Box::new(sets.clone()), bench.remote.clone());
     let manifest = Wanted { digest: bundle.digest, length: bundle.length };
-    let Done::Manifest(read) = work(&mut worker, Job::Manifest { wanted: manifest }).await else {
+    let Done::Manifest { manifest: read, bytes } = work(&mut worker, Job::Manifest { wanted: manifest }).await else {
         panic!("no manifest")
     };
-    assert_eq!(*read, bundle.manifest);
+    assert_eq!((*read, Digest::of(&bytes)), (bundle.manifest.clone(), bundle.digest));
     let wanted = program(&bundle);
     assert!(matches!(work(&mut worker, Job::Fetch { wanted, bases: Vec::new(), rate_bytes_s: 0 }).await, Done::Ok));
     assert_eq!(sets.read(&wanted.digest, wanted.length).expect("is there").len() as u64, wanted.length);

@@ -14,7 +14,8 @@ use midshift_agent::session::{AgentConfig, Error, Lines, Updates, run};
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::sets::{Sets, Wanted};
 use midshift_agent::sqlite::SqliteStore;
-use midshift_agent::store::Store;
+use midshift_agent::store::{Op, Store};
+use midshift_agent::update::SoftwareRow;
 use midshift_agent::update::io::UpdateWorker;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::installed;
@@ -463,6 +464,10 @@ fn one_set() -> MemorySets {
 #[tokio::test(start_paused = true)]
 async fn a_robot_signs_what_it_has_installed_in_its_first_hello_with_a_key_that_it_keeps() {
     let (store, releases) = (MemoryStore::new(), Releases::new());
+    store.load_now("ring-1");
+    // An agent that kept no documents has committed it.
+    let software = SoftwareRow { directive: 1, ..SoftwareRow::default() };
+    store.commit_now(&[Op::Software(Box::new(software))]);
     let mut keys = Vec::new();
     for _ in 0..2 {
         let worker = UpdateWorker::new(Box::new(one_set()), Arc::new(releases.clone()));

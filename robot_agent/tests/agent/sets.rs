@@ -289,6 +289,55 @@ fn a_set_that_was_half_deleted_or_half_made_is_none_and_is_made_again() {
 }
 
 #[test]
+fn a_file_that_was_changed_is_found_thrown_away_and_put_in_place_anew() {
+    for place in Place::both() {
+        let mut sets = place.open();
+        let (program, settings) = (b"program of a robot", b"its settings");
+        let set = staged(&mut *sets, "v1", program, settings);
+        let (id, gait) = (set.id(), &set.components["gait"]);
+        let files = ["gait", "behaviour", PROGRAM];
+        files.iter().for_each(|file| sets.check(&id, file).expect("is whole"));
+        place.rot(&gait.digest);
+        for file in ["gait", PROGRAM] {
+            assert!(matches!(sets.check(&id, file), Err(Error::Corrupt { digest }) if digest == gait.digest), "{file}");
+        }
+        sets.check(&id, "behaviour").expect("is whole");
+        sets.discard(&wanted(settings)).expect("is right");
+        sets.discard(&wanted(program)).expect("goes");
+        assert!(sets.mend(&set).is_err(), "its content is not there");
+        assert_eq!(put(&mut *sets, program).digest, gait.digest);
+        sets.mend(&set).expect("mends");
+        files.iter().for_each(|file| sets.check(&id, file).expect("is whole"));
+        sets.mend(&set).expect("nothing to do");
+        sets.verify(&id).expect("is whole");
+        assert!(matches!(sets.check(&id, "wings"), Err(Error::Missing(_))));
+    }
+}
+
+#[test]
+fn a_program_and_a_page_that_were_put_in_place_of_a_sets_own_are_found_and_replaced() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut sets = DiskSets::open(folder.path()).expect("opens");
+    let set = staged(&mut sets, "v1", b"#!/bin/sh\nexit 7\n", b"settings");
+    let lies = folder.path().join(set.id().to_string());
+    let program = lies.join(PROGRAM);
+    fs::remove_file(&program).expect("removes");
+    fs::write(&program, b"#!/bin/sh\nexit 6\n").expect("writes");
+    assert!(matches!(sets.check(&set.id(), PROGRAM), Err(Error::Corrupt { .. })));
+    sets.check(&set.id(), "gait").expect("the component is another file");
+    let page = fs::read_to_string(lies.join("set.json")).expect("reads");
+    fs::write(lies.join("set.json"), page.replace("v1", "v7")).expect("writes");
+    assert!(matches!(sets.check(&set.id(), PROGRAM), Err(Error::Missing(_))), "it is no set of that name");
+    sets.mend(&set).expect("mends");
+    assert_eq!(fs::read(&program).expect("reads"), b"#!/bin/sh\nexit 7\n");
+    assert_eq!(fs::metadata(&program).expect("is there").permissions().mode() & 0o777, 0o755);
+    sets.check(&set.id(), PROGRAM).expect("is whole");
+    let mut names: Vec<_> = fs::read_dir(&lies).expect("lists").map(|e| e.expect("an entry").file_name()).collect();
+    names.sort();
+    assert_eq!(names, ["behaviour", "gait", "set.json", PROGRAM], "nothing is left beside");
+}
+
+#[test]
 fn a_damaged_switch_record_is_an_error_and_deletes_nothing() {
     let folder = tempfile::tempdir().expect("a folder");
     let mut sets = DiskSets::open(folder.path()).expect("opens");

@@ -21,9 +21,11 @@ use midshift_agent::stop::keep::{FileStops, KeepStops, STOP_FILE, unreadable};
 use midshift_agent::store::{Kept, Op, Store};
 use midshift_agent::trust::Trust;
 use midshift_agent::update::migrate::DueMigration;
+use midshift_agent::update::proven::Proven;
 use midshift_agent::update::{HeldKeys, SoftwareRow, Update};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::keys::SecretKey;
+use midshift_bundle::release::Release;
 use midshift_bundle::set::SetManifest;
 use midshift_bundle::trust::Trusted;
 use midshift_core::ids::{AreaId, DrainId, RobotId, SiteId};
@@ -55,7 +57,7 @@ ALTER TABLE lane ADD COLUMN mood TEXT;
 ALTER TABLE sample ADD COLUMN mood TEXT NOT NULL DEFAULT 'plain';
 ALTER TABLE gap ADD COLUMN mood TEXT NOT NULL DEFAULT 'plain';
 UPDATE fact SET value = json_set(value, '$.next_version', 7)
-    WHERE key IN ('session', 'applied', 'holder', 'places', 'software', 'trusted');
+    WHERE key IN ('session', 'applied', 'holder', 'places', 'software', 'trusted', 'proven');
 UPDATE fact SET value = json_set(value, '$[0].next_version', 7, '$[0].software.next_version', 7) WHERE key = 'policy';
 UPDATE fact SET value = json_set(value, '$.attempt.next_version', 7, '$.intent.next_version', 7) WHERE key = 'holder';
 UPDATE fact SET value = json_set(value, '$.keys.next_version', 7, '$.due[0].next_version', 7,
@@ -124,6 +126,23 @@ fn update(state: UpdateState) -> Update {
     }
 }
 
+/// What may run, with the documents of a release.
+fn proven() -> Proven {
+    let releases = Releases::new();
+    let bundle = releases.release("2.0.0");
+    let documents = releases.documents();
+    let text = |name: &str| String::from_utf8_lossy(&documents[name]).into_owned();
+    let release = Release::new(&text("1.root.json"), &text("2.targets.json"), &bundle.manifest.to_bytes());
+    let set = set("v2", b"program", b"settings");
+    let mut proven = Proven { directive: 3, ..Proven::default() };
+    proven.committed.previous = Some("v1".to_owned());
+    proven.intended = Some(proven.committed.clone());
+    proven.believed = set.components.values().cloned().collect();
+    proven.sets.insert(set.id(), set);
+    proven.releases.insert(bundle.digest, Arc::new(release.expect("a release")));
+    proven
+}
+
 /// Every kind of fact, subject and attempt.
 fn rows(state: UpdateState) -> Vec<Op> {
     let done = attempt("T1", 4);
@@ -180,6 +199,7 @@ fn rows(state: UpdateState) -> Vec<Op> {
         Op::Maintenance(Some(DrainId::parse("drain-1").expect("a name"))),
         Op::Software(Box::new(software)),
         Op::Trusted(Arc::new(trusted)),
+        Op::Proven(Arc::new(proven())),
         Op::Device(DeviceKey::of_seed([9; 32])),
         Op::Epoch(attempt("T3", 1).subject, 8, 3_000),
         Op::Finish(Arc::new(report), listed, 2_000),
@@ -220,7 +240,7 @@ async fn the_ledger_and_the_ring_of_a_newer_version_are_read_and_what_it_added_o
         let gap = Gap { lane: Lane::Status, from_seq: 1, to_seq: 1, reason: Code::Overflow.into() };
         let before = write(&path, vec![Op::Gap(gap)], 0).await;
         Successor::open(&path).await.writes(ADDED).await;
-        assert_eq!(Successor::open(&path).await.number(FIELDS).await, 17, "each object has one");
+        assert_eq!(Successor::open(&path).await.number(FIELDS).await, 18, "each object has one");
         assert_eq!(started(&path).await.1, before, "{state:?}");
         // This version writes each kind of row anew.
         write(&path, rows, 1).await;

@@ -102,10 +102,10 @@ impl Machine {
         change(&mut switch);
         Ok(sets.write_switch(&mut switch)?)
     }
-    /// The ledger of an agent that has just switched to this set.
-    async fn remember_probation(&self, set: &SetManifest) -> anyhow::Result<()> {
+    /// The ledger of an agent that has just switched to this set, or has committed it.
+    async fn remember(&self, set: &SetManifest, state: UpdateState) -> anyhow::Result<()> {
         let update = Update {
-            state: UpdateState::Probation,
+            state,
             bundle: Digest::of(b"bundle"),
             manifest_length: 1,
             rollback_floor: 0,
@@ -174,7 +174,7 @@ async fn put_away(behaviour: &str) -> anyhow::Result<String> {
     let set = machine.stage("1.5.0", behaviour)?;
     let name = set.id().to_string();
     machine.switch(|switch| switch.try_out(&name))?;
-    machine.remember_probation(&set).await?;
+    machine.remember(&set, UpdateState::Probation).await?;
     // Nobody listens there: what a set does to its program needs no server.
     let mut launched = machine.launch("127.0.0.1:1", None)?;
     let code = launched.0.ends().await?;
@@ -209,6 +209,7 @@ async fn a_launched_robot_says_the_version_of_the_set_it_runs() -> anyhow::Resul
         switch.try_out(&set.id().to_string());
         switch.commit();
     })?;
+    machine.remember(&set, UpdateState::Committed).await?;
     let _launched =
         machine.launch(&server.address.to_string(), enrolment(server.address, "rbt-01").await?.as_deref())?;
     assert_eq!(version_at(&server).await?, "1.5.0", "{}", text_of(&machine.log()));
@@ -263,6 +264,7 @@ async fn an_agent_ends_when_its_launcher_is_killed_and_a_second_launcher_is_refu
             switch.try_out(&set.id().to_string());
             switch.commit();
         })?;
+        machine.remember(&set, UpdateState::Committed).await?;
         let mut launched = machine.launch_by(exec, "127.0.0.1:1", None)?;
         // Who has the lock of its data folder lives.
         let lock = machine.path("data").join(AGENT_FILE).with_extension("lock");

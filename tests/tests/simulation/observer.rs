@@ -677,6 +677,7 @@ fn kind(op: &Op) -> &'static str {
         Op::Maintenance(_) => "maintenance",
         Op::Software(_) => "software",
         Op::Trusted(_) => "trusted",
+        Op::Proven(_) => "proven",
         Op::Device(_) => "device",
         Op::Epoch(..) => "epoch",
         Op::Finish(..) => "finish",
