@@ -58,8 +58,6 @@ impl Folder {
                 }
             }
         }
-        let folder = self.targets();
-        File::open(&folder).and_then(|folder| folder.sync_all()).map_err(io("writing", &folder))?;
         Ok(made)
     }
 
@@ -109,7 +107,7 @@ impl Folder {
         };
         let name = way.target();
         let path = self.file(&name, digest);
-        fs::rename(&beside, &path).map_err(io("naming", &path))?;
+        midshift_durable::rename(&beside, &path).map_err(io("naming", &path))?;
         Ok(Some(FileTarget { name, digest, length }))
     }
 }
