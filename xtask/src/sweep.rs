@@ -56,7 +56,7 @@ pub const NIGHTLY: [Sweep; 3] = [Sweep::Stories, Sweep::Night, Sweep::OldSites];
 pub const NIGHTLY_SEEDS: u64 = 4;
 
 impl Sweep {
-    const ALL: [Self; 11] = [
+    const ALL: [Self; 12] = [
         Self::Kills,
         Self::Simulation,
         Self::Players,

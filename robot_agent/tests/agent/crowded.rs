@@ -109,6 +109,19 @@ impl Sets for CrowdedSets {
         self.disk().verify(id)
     }
 
+    fn check(&mut self, set: &Digest, file: &str) -> Result<(), Error> {
+        self.disk().check(set, file)
+    }
+
+    fn discard(&mut self, wanted: &Wanted) -> Result<(), Error> {
+        self.disk().discard(wanted)
+    }
+
+    fn mend(&mut self, set: &SetManifest) -> Result<(), Error> {
+        self.find_room("mending a set")?;
+        self.disk().mend(set)
+    }
+
     fn program(&mut self, set: &Digest) -> Option<PathBuf> {
         self.disk().program(set)
     }

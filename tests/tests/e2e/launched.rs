@@ -238,7 +238,7 @@ async fn a_robot_that_falls_from_the_next_version_goes_on_with_the_files_that_it
         switch.commit();
         switch.try_out(&next.id().to_string());
     })?;
-    machine.remember_probation(&next).await?;
+    machine.remember(&next, UpdateState::Probation).await?;
     machine.add_what_is_new().await?;
     let _launched =
         machine.launch(&server.address.to_string(), enrolment(server.address, "rbt-01").await?.as_deref())?;

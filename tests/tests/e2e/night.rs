@@ -514,7 +514,7 @@ impl Night {
         let explained = call(&["rollout", "explain", "--server", &self.address, id, &robot, "-o", "json"])?;
         let said = String::from_utf8_lossy(&explained.stdout);
         ensure!(explained.status.success() && said.contains(code), "{explained:?}");
-        let told = incidents(&self.server)?;
+        let told = incidents(self.server.address)?;
         let is_told = told.iter().any(|i| i["robotId"] == robot.as_str() && i["reason"]["code"] == code);
         ensure!(is_told, "no incident of {robot}: {told:?}");
         done(&["rollout", "lost", "--server", &self.address, id, &robot, "--reason", "nobody finds it"])
