@@ -136,7 +136,15 @@ pub fn spare_name(is_taken: impl Fn(&str) -> bool) -> String {
 
 fn everything() -> Wanted {
     let site = |role| Grant { role, scope: Scope::Site };
-    let roles = [Role::Admin, Role::Operator, Role::OtaAuthor, Role::OtaApprover, Role::StopResetter, Role::Auditor];
+    let roles = [
+        Role::Admin,
+        Role::Operator,
+        Role::OtaAuthor,
+        Role::OtaApprover,
+        Role::OtaFullPush,
+        Role::StopResetter,
+        Role::Auditor,
+    ];
     Wanted { name: FIRST.to_owned(), person: None, grants: roles.map(site).into(), valid: limits::TOKEN_VALID_MAX }
 }
 
