@@ -163,6 +163,28 @@ async fn a_robot_without_progress_is_stopped_but_not_while_it_waits_for_a_place(
     w.lawful().await;
 }
 
+#[tokio::test(start_paused = true)]
+async fn a_task_that_a_robot_failed_is_kept_a_minute_for_another_that_is_busy() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("near", "park-a").await;
+    w.robot("other", "park-b").await;
+    w.pass(2).await;
+    w.r("other").drives = false;
+    w.submit_with("T1", "A", "B", |raw| {
+        raw.robot_id = "other".to_owned();
+        raw.stall_ms = Some(3_600_000);
+    })
+    .await;
+    w.until_phase("T1", Phase::Running).await;
+    w.r("near").fails = Some((0, obstacle()));
+    w.submit_with("T2", "A", "B", |raw| raw.retry = twice()).await;
+    w.until("it waits again", |s| s.phase("T2") == Phase::Queued && s.task("T2").epoch == 1).await;
+    w.pass_while(50, "it is kept for the other", |s| s.phase("T2") == Phase::Queued).await;
+    let seen = w.until("it is given again", |s| s.task("T2").epoch == 2).await;
+    assert_eq!(seen.robot_of("T2").as_deref(), Some("near"), "nobody else was free");
+    w.lawful().await;
+}
+
 /// Beside a robot that ends whatever it takes an honest one does four tasks, and the first is broken off. Gives back how
 /// many of them it had.
 async fn beside_one_that_ends(state: WorkState) -> usize {
