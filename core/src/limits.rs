@@ -55,6 +55,8 @@ pub const AGENT_TIMEOUT_EARLIER_PERMILLE: u64 = 50;
 pub const BREAKER_FAILURES: usize = 3;
 /// ... within this time take the robot out of dispatch until a person says so.
 pub const BREAKER_WINDOW: SiteDuration = SiteDuration::from_secs(600);
+/// So long a queued task that a robot failed goes to another that could do it, even if that one has other work now.
+pub const OTHERS_FIRST: SiteDuration = SiteDuration::from_secs(60);
 /// After an offer that it heard and did not answer a robot gets none for this long; it doubles with each in a row ...
 pub const UNANSWERED_PAUSE: LinkDuration = LinkDuration::from_secs(2);
 /// ... up to this.

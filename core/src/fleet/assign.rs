@@ -44,7 +44,7 @@ pub fn plan(view: &mut View, board: &Board, now: Now, heard: &BTreeSet<RobotId>,
         if screen::task(view, board, task, intake, &now).is_err() {
             continue;
         }
-        if let Some(robot_id) = idle.take(view, board, task, intake, &mut plan.slice) {
+        if let Some(robot_id) = idle.take(view, board, task, intake, &now, &mut plan.slice) {
             let (task, intake) = (task.clone(), intake.clone());
             plan.decide(view, now, "fleet", |tx| offer(tx, &task, &intake, &robot_id, board));
             plan.report.offers += 1;
@@ -52,7 +52,7 @@ pub fn plan(view: &mut View, board: &Board, now: Now, heard: &BTreeSet<RobotId>,
         }
         if recalled > 0 {
             recalled -= 1;
-        } else if let Some(robot_id) = errands.take(view, board, task, intake, &mut plan.slice) {
+        } else if let Some(robot_id) = errands.take(view, board, task, intake, &now, &mut plan.slice) {
             plan.decide(view, now, "fleet", |tx| errands::stop(tx, &robot_id));
         }
     }

@@ -54,7 +54,7 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
     let mut filtered = BTreeMap::new();
     let robots = waits.then(|| screened(view, board, now));
     for (robot_id, against) in robots.into_iter().flatten() {
-        let reason = screen::pair(view, board, robot_id, task, intake).err().or_else(|| against.clone());
+        let reason = screen::pair(view, board, robot_id, task, intake, now).err().or_else(|| against.clone());
         if let Some(reason) = &reason {
             *filtered.entry(reason.code).or_default() += 1;
         }
@@ -164,7 +164,7 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
         let task = view.task(task_id)?;
         let intake = view.intake(task_id)?;
         let reason = screen::task(view, board, task, intake, now)
-            .and_then(|()| screen::pair(view, board, robot_id, task, intake))
+            .and_then(|()| screen::pair(view, board, robot_id, task, intake, now))
             .err();
         let goal = intake
             .spec

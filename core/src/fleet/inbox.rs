@@ -5,7 +5,8 @@
 use super::Tx;
 use super::rows::{HoldToken, HolderState, RobotControl};
 use super::tasks::{News, event_of, happen};
-use super::{Board, Tally, answers, claims, errands, incidents, plausible, tasks};
+use super::view::View;
+use super::{Board, Tally, answers, breaker, claims, errands, incidents, plausible, tasks};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::{Code, Reason};
 use crate::robot::{HardwareStop, Load, Mode};
@@ -20,7 +21,13 @@ pub fn take(tx: &mut Tx, entry: &InboxEntry, board: &Board, tally: &mut Tally) {
     let SampleBody::Event(event) = &sample.body else { return };
     let robot_id = &entry.robot_id;
     match event {
-        RobotEvent::Attempt(report) => attempt(tx, robot_id, report, tally),
+        RobotEvent::Attempt(report) => {
+            breaker::let_go(tx, robot_id, report);
+            if calls_offer_over(tx.view, robot_id, report) {
+                answers::refused(tx, robot_id, report);
+            }
+            attempt(tx, robot_id, report, tally);
+        }
         RobotEvent::Place { place_id, grant_id, news: PlaceNews::Entered }
             if claims::waits_for_heartbeat(tx.view, board, robot_id, place_id) =>
         {
@@ -42,13 +49,20 @@ pub fn take(tx: &mut Tx, entry: &InboxEntry, board: &Board, tally: &mut Tally) {
     }
 }
 
+/// An offer stands, and its robot says that it is over without having taken or refused it.
+fn calls_offer_over(view: &View, robot_id: &RobotId, report: &AttemptReport) -> bool {
+    let attempt = view.attempt(&report.attempt).filter(|a| a.robot_id == *robot_id);
+    let stands = attempt.is_some_and(|a| a.phase == AttemptPhase::Offered && a.uncertain.is_none());
+    stands && matches!(report.state, WorkState::Aborted | WorkState::Suspended)
+}
+
 /// Obeys news of an attempt, from the inbox or from an inventory.
 pub fn attempt(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, tally: &mut Tally) {
     let id = &report.attempt;
     let is_offer = tx.view.attempt(id).is_some_and(|a| a.accepted.is_none() && a.robot_id == *robot_id);
     if is_offer && report.state == WorkState::Refused {
         answers::refused(tx, robot_id, report);
-    } else if is_offer && report.state != WorkState::Aborted {
+    } else if is_offer && !matches!(report.state, WorkState::Aborted | WorkState::Suspended) {
         answers::answered(tx, robot_id);
     }
     if let Some(why) = plausible::judge(tx.view, id, robot_id, report.state, report.step_index) {
@@ -62,8 +76,13 @@ pub fn attempt(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, tally: &
     let ours = (newest.as_ref() == Some(id)
         && tx.view.task(task_id).is_some_and(|t| t.robot_id.as_ref() == Some(robot_id)))
         || tx.view.bugs.late_reports_count();
-    let moved = ours
-        && happen(tx, task_id, News { event: event_of(report), why: report.refusal.as_ref(), report: Some(report) });
+    let is_taken = tx.view.attempt(id).is_some_and(|a| a.accepted.is_some());
+    let (event, why) = match event_of(report) {
+        // What it took before it cannot refuse any more: it says that it does not have it.
+        Event::Refused if is_taken => (Event::StopConfirmed, None),
+        event => (event, report.refusal.as_ref()),
+    };
+    let moved = ours && happen(tx, task_id, News { event, why, report: Some(report) });
     if !moved {
         tally.fenced += 1;
     }

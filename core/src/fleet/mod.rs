@@ -2,7 +2,7 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
 //! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `plausible`, `claims`, `answers`, `commands` (`asked`: which there are) are what happens; `tasks` moves tasks by
-//! the table; `heard`, `anchor`, `attempts`, `incidents` and `refused` are what they share; `queue`, `screen`, `pool` and `assign` give work, in turns cut by `slice`; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `standing` says what is done or waited for, `explain` tells people, `unexplained` counts what nobody can say, `lasting` opens incidents of robots that stand for long; `maps` says what a changed map waits for.
+//! the table and `breaker` counts what robots fail; `heard`, `anchor`, `attempts`, `incidents` and `refused` are what they share; `queue`, `screen`, `pool` and `assign` give work, in turns cut by `slice`; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `standing` says what is done or waited for, `explain` tells people, `unexplained` counts what nobody can say, `lasting` opens incidents of robots that stand for long; `maps` says what a changed map waits for.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
@@ -10,6 +10,7 @@ pub mod answers;
 pub mod asked;
 pub mod assign;
 pub mod attempts;
+pub mod breaker;
 pub mod budget;
 pub mod bugs;
 pub mod claims;

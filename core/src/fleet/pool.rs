@@ -8,6 +8,7 @@ use super::{Board, Slice, screen, way};
 use crate::ids::RobotId;
 use crate::site::WaypointIx;
 use crate::task::{TaskIntake, TaskState};
+use crate::time::Now;
 use std::collections::BTreeSet;
 
 /// A robot that a task may go to.
@@ -65,6 +66,7 @@ impl Pool {
         board: &Board,
         task: &TaskState,
         intake: &TaskIntake,
+        now: &Now,
         slice: &mut Slice,
     ) -> Option<RobotId> {
         if self.left.is_empty() {
@@ -79,7 +81,7 @@ impl Pool {
         };
         let mut passes = |nth: &usize| {
             slice.look(1);
-            screen::pair(view, board, &self.all[self.left[*nth].0].robot_id, task, intake).is_ok()
+            screen::pair(view, board, &self.all[self.left[*nth].0].robot_id, task, intake, now).is_ok()
         };
         // Nearly always the first one passes; only else are all put in order.
         let mut first = None;

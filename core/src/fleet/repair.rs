@@ -19,7 +19,9 @@ use crate::work::{AttemptReport, Live, PlaceNews, WorkState};
 /// Counts the time in which the robot is heard.
 fn attached(view: &mut View, robot_id: &RobotId, board: &Board, now: &Now) {
     let heard = presence(board, robot_id, now) == Presence::Online;
-    let time = view.attached.entry(robot_id.clone()).or_insert(super::view::Attached { ms: 0, until: now.site });
+    let fresh = super::view::Attached { ms: 0, until: now.site, is_heard: heard };
+    let time = view.attached.entry(robot_id.clone()).or_insert(fresh);
+    time.is_heard = heard;
     if heard {
         time.ms += now.site.since(time.until).as_ms();
     }

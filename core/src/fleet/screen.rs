@@ -115,11 +115,13 @@ pub fn pair(
     robot_id: &RobotId,
     task: &TaskState,
     intake: &TaskIntake,
+    now: &Now,
 ) -> Result<(), Reason> {
     let Some(session) = view.sessions.get(robot_id.as_str()).map(|s| &s.row) else {
         return Err(Code::RobotOffline.into());
     };
     fits(view, session, task, intake)?;
+    prefer_others(view, robot_id, task, intake, now)?;
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
     just_refused(view, live, task)?;
     let load = load::carried(view, live);
@@ -150,6 +152,37 @@ pub fn pair(
 fn fits(view: &View, session: &Session, task: &TaskState, intake: &TaskIntake) -> Result<(), Reason> {
     bound(&session.robot_id, task, intake)?;
     able(view, session, intake)
+}
+
+/// Keeps a task for a while from a robot that failed it, as long as another could do it.
+fn prefer_others(
+    view: &View,
+    robot_id: &RobotId,
+    task: &TaskState,
+    intake: &TaskIntake,
+    now: &Now,
+) -> Result<(), Reason> {
+    let waited_ms = now.ms_since(task.queued_since);
+    let is_early = waited_ms < limits::OTHERS_FIRST.as_ms();
+    let has_failed = task.opened.is_none() && task.failed_robots.contains(robot_id);
+    if has_failed && is_early && another_could(view, task, intake, robot_id) {
+        let told = "The robot failed this task, and for a while it is kept for another that could do it.";
+        let left_ms = limits::OTHERS_FIRST.as_ms() - waited_ms;
+        return Err(Reason::new(Code::ExcludedAfterFailure, told).with("again_in_ms", left_ms));
+    }
+    Ok(())
+}
+
+/// Whether another robot than this one could do the task, apart from its other work: it is heard, nothing that people
+/// decided keeps it from work, and it has not failed the task.
+pub(super) fn another_could(view: &View, task: &TaskState, intake: &TaskIntake, robot_id: &RobotId) -> bool {
+    let is_at_work = |id: &RobotId| {
+        let is_heard = view.attached.get(id).is_some_and(|attached| attached.is_heard);
+        is_heard && decided_by_people(view, id, None).is_ok()
+    };
+    let sessions = view.sessions.values().map(|session| &session.row);
+    let mut others = sessions.filter(|s| s.robot_id != *robot_id && !task.failed_robots.contains(&s.robot_id));
+    others.any(|other| is_at_work(&other.robot_id) && fits(view, other, task, intake).is_ok())
 }
 
 /// Whether the task itself leaves the robot out, whatever it can do.

@@ -4,8 +4,8 @@
 //! `task::machine::next`.
 
 use super::Tx;
-use super::rows::{HolderState, RobotAuthority, RobotControl, RobotCounter, RobotHolder, Timer, TimerKind};
-use super::{attempts, incidents, plausible};
+use super::rows::{HolderState, RobotAuthority, RobotCounter, RobotHolder, Timer, TimerKind};
+use super::{attempts, breaker, plausible, screen};
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -58,6 +58,10 @@ fn facts(tx: &Tx, task: &TaskState, intake: &TaskIntake, attempt: Option<&Attemp
     let refusal = news.report.and_then(|r| r.refusal.as_ref()).map(|r| r.code);
     let semantic_refusal = refusal == Some(Code::UnsupportedAction);
     let refusers = task.semantic_refusers.len() + usize::from(semantic_refusal);
+    let semantic = news.report.is_some_and(says_semantic);
+    // Of two robots that failed it a person hears.
+    let is_first = |a: &&Attempt| task.failed_robots.iter().all(|failed| *failed == a.robot_id);
+    let elsewhere = |a: &Attempt| screen::another_could(tx.view, task, intake, &a.robot_id);
     Facts {
         retries_left: task.failures < intake.spec.retry.max_retry_times,
         retry_wanted: intake.spec.retry.max_retry_times > 0,
@@ -66,10 +70,16 @@ fn facts(tx: &Tx, task: &TaskState, intake: &TaskIntake, attempt: Option<&Attemp
         begun_repeatable: begun.into_iter().all(|s| s.effect == Effect::Repeatable),
         refusals_spent: task.refusals_in_row + 1 >= limits::REFUSALS_IN_ROW && are_enough(tx, task),
         refused_by_all: semantic_refusal && refusers >= tx.view.sessions.len(),
-        semantic: news.report.and_then(|r| r.fault.as_ref()).is_some_and(|f| f.class == FaultClass::Semantic),
+        semantic,
+        elsewhere: semantic && attempt.filter(is_first).is_some_and(elsewhere),
         held: is_held(tx, task),
         accepted: attempt.is_some_and(|a| a.accepted.is_some()),
     }
+}
+
+/// Whether the robot says that the work cannot be done as asked.
+fn says_semantic(report: &AttemptReport) -> bool {
+    report.fault.as_ref().is_some_and(|f| f.class == FaultClass::Semantic)
 }
 
 /// Whether so many different robots have refused it, with the one that does now, that a person is asked: five, or all where there are fewer. One
@@ -183,7 +193,7 @@ pub fn end_attempt(tx: &mut Tx, a: &mut Attempt) {
     count(tx, a);
     let robots_fault = a.fault.as_ref().is_some_and(|f| f.class != FaultClass::Semantic);
     if a.phase == AttemptPhase::Failed && robots_fault {
-        trip(tx, &a.robot_id);
+        breaker::trip(tx, &a.robot_id);
     }
 }
 
@@ -228,21 +238,6 @@ fn counter(tx: &mut Tx, robot_id: &RobotId, software: &str) -> RobotCounter {
     counter.counted = tx.now.utc;
     counter.attached_ms += tx.view.attached.get_mut(robot_id).map_or(0, |heard| std::mem::take(&mut heard.ms));
     counter
-}
-
-/// Notes a failure of the robot; three within the window take it out of dispatch until a person says so.
-fn trip(tx: &mut Tx, robot_id: &RobotId) {
-    let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
-    let mut control = known.unwrap_or_else(|| RobotControl::new(robot_id.clone()));
-    let now = tx.now.utc;
-    control.failures.retain(|at| now.ms_since(*at) <= limits::BREAKER_WINDOW.as_ms());
-    control.failures.push(now);
-    if control.failures.len() >= limits::BREAKER_FAILURES && control.breaker.is_none() {
-        control.breaker = Some(now);
-        let reason = Reason::from(Code::RobotBreakerOpened).with("failures", control.failures.len());
-        incidents::open(tx, reason, Some(robot_id), None);
-    }
-    tx.put(control, "robot.failed");
 }
 
 /// Takes back every grant the robot has not entered: it stays taken until the robot says so.
@@ -313,6 +308,9 @@ fn move_task(tx: &mut Tx, mut t: TaskState, a: Option<&Attempt>, step: Next, new
     {
         t.stats += a.stats;
         count_end(&mut t, a, news, step);
+        if t.phase == Phase::Succeeded {
+            breaker::disprove(tx, &t);
+        }
     }
     if t.phase != was {
         entered(tx, &mut t, was, news, intake);
@@ -338,10 +336,13 @@ fn count_end(t: &mut TaskState, a: &Attempt, news: &News, step: Next) {
     }
     t.refusals_in_row = 0;
     t.refusers.clear();
-    let failed = matches!(news.event, Event::FailedRecoverable | Event::FailedFinal) || step.phase == Phase::RetryWait;
-    if failed && a.accepted.is_some() {
+    let failed = matches!(news.event, Event::FailedRecoverable | Event::FailedFinal);
+    if failed || (step.phase == Phase::RetryWait && a.accepted.is_some()) {
         t.failures += 1;
         t.failed_robots.insert(a.robot_id.clone());
+    }
+    if failed && news.report.is_some_and(says_semantic) {
+        t.semantic_refusers.insert(a.robot_id.clone());
     }
 }
 

@@ -73,6 +73,6 @@ fn is_explained(view: &View, board: &Board, now: &Now, task: &TaskState, idle: &
     match standing::of_task(view, board, now, task, intake) {
         Some(why) => standing::is_told(&why),
         None if task.phase != Phase::Queued => false,
-        None => idle.iter().all(|robot_id| screen::pair(view, board, robot_id, task, intake).is_err()),
+        None => idle.iter().all(|robot_id| screen::pair(view, board, robot_id, task, intake, now).is_err()),
     }
 }

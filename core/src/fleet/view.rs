@@ -37,6 +37,8 @@ pub struct Attached {
     pub ms: u64,
     /// Up to when, site clock.
     pub until: crate::time::SiteTime,
+    /// It was heard then.
+    pub is_heard: bool,
 }
 
 /// What a robot waits for. Volatile: waiting reasons never go through the store.

@@ -230,6 +230,8 @@ pub struct Facts {
     pub refused_by_all: bool,
     /// The fault says that the work cannot be done as asked.
     pub semantic: bool,
+    /// No other robot failed it, and one that is heard could do it.
+    pub elsewhere: bool,
     /// A hold token stands.
     pub held: bool,
     /// The robot had accepted.
@@ -290,9 +292,17 @@ fn after_recoverable(facts: &Facts) -> Phase {
     }
 }
 
-/// Where an attempt that failed for good leads.
+/// Where an attempt that failed for good leads. What one robot cannot do as asked another is given before a person is
+/// asked.
 fn after_final(facts: &Facts) -> Phase {
-    if facts.semantic && !facts.opened && facts.refused_by_all { Phase::Failed } else { Phase::NeedsOperator }
+    let is_open_to_others = facts.semantic && !facts.opened;
+    if is_open_to_others && facts.refused_by_all {
+        Phase::Failed
+    } else if is_open_to_others && facts.begun_repeatable && facts.elsewhere && facts.retries_left {
+        Phase::RetryWait
+    } else {
+        Phase::NeedsOperator
+    }
 }
 
 /// Where a robot's drop of a running task leads: it stands without anybody having asked for it.

@@ -74,7 +74,7 @@ pub struct TaskState {
     pub refusers: BTreeSet<RobotId>,
     /// Robots whose attempt failed.
     pub failed_robots: BTreeSet<RobotId>,
-    /// Robots that refused it for its content.
+    /// Robots that refused it for its content, or took it and then said that it cannot be done as asked: never again on these.
     pub semantic_refusers: BTreeSet<RobotId>,
     /// UTC, since when it waits (admission, hand-back, end of back-off).
     pub queued_since: Utc,

@@ -40,6 +40,10 @@ habits! {
     AnswersLate "answers late";
     /// It refuses, for any reason there is.
     Refuses "refuses";
+    /// It takes offers and lets them go at once, unasked.
+    LetsGo "accepts and lets go";
+    /// It takes offers and says at once that they cannot be done as asked.
+    CallsImpossible "fails as semantic";
     /// It says what it has said again, under new numbers.
     RepeatsItself "repeats itself";
     /// It says of its attempt what contradicts what it has said.
@@ -99,6 +103,7 @@ impl Player {
             Habit::NeverAnswers | Habit::AnswersLate | Habit::Refuses | Habit::NeverMovesOn | Habit::NeverEnds => {
                 return;
             }
+            Habit::LetsGo | Habit::CallsImpossible => return,
             Habit::WrongClocks | Habit::LosesNumbers => return,
             Habit::FallsSilent | Habit::Restarts | Habit::StartsTwice => 0.05,
             Habit::EndlessLists | Habit::ClaimsUpdates | Habit::EndlessTexts | Habit::FloodsStatus => 0.1,

@@ -5,7 +5,7 @@
 use super::{Habit, Player};
 use midshift_core::ids::{AttemptId, PlaceId};
 use midshift_core::reason::{Code, Reason};
-use midshift_core::robot::{Load, ReportedAttempt, WorkState};
+use midshift_core::robot::{FAULT_SEMANTIC, Fault, FaultClass, Load, ReportedAttempt, WorkState};
 use midshift_core::work::{
     Assignment, AttemptReport, DesiredWork, Effect, PlaceNews, RobotEvent, StepKind, WorkStats, WorkStep,
 };
@@ -119,6 +119,13 @@ impl Player {
         if self.shows(Habit::FallsSilent, 0.7) {
             self.quiet_until = now_ms + self.rng.random_range(2_000..45_000);
         }
+        if self.shows(Habit::LetsGo, 0.8) {
+            let states = [WorkState::Aborted, WorkState::Suspended, WorkState::Refused];
+            let state = states.choose(&mut self.rng).copied().unwrap_or(WorkState::Aborted);
+            self.end(state);
+        } else if self.shows(Habit::CallsImpossible, 0.8) {
+            self.end(WorkState::Failed);
+        }
     }
     /// A step is done.
     fn did(&mut self, step: &WorkStep) {
@@ -165,8 +172,14 @@ impl Player {
         let Some(listed) = self.listed() else { return self.job = None };
         listed.state = state;
         let report = report_of(&listed.attempt, state, listed.step_index, listed.opened);
+        let refusal = (state == WorkState::Refused).then(|| Code::AnotherHolder.into());
+        let fault = (state == WorkState::Failed).then(|| Fault {
+            code: FAULT_SEMANTIC,
+            class: FaultClass::Semantic,
+            message: "not as asked".to_owned(),
+        });
         self.job = None;
-        self.event(RobotEvent::Attempt(report));
+        self.event(RobotEvent::Attempt(AttemptReport { refusal, fault, ..report }));
         self.beat_at = 0;
     }
     /// What it lists of the attempt at hand.

@@ -30,12 +30,13 @@ const NO_FACTS: Facts = Facts {
     refusals_spent: false,
     refused_by_all: false,
     semantic: false,
+    elsewhere: false,
     held: false,
     accepted: false,
 };
 
 fn all_facts() -> impl Iterator<Item = Facts> {
-    (0..1024_u32).map(|bits| {
+    (0..2048_u32).map(|bits| {
         let bit = |n: u32| bits & (1 << n) != 0;
         Facts {
             retries_left: bit(0),
@@ -48,6 +49,7 @@ fn all_facts() -> impl Iterator<Item = Facts> {
             semantic: bit(7),
             held: bit(8),
             accepted: bit(9),
+            elsewhere: bit(10),
         }
     })
 }
@@ -110,6 +112,7 @@ fn facts_named(names: &str) -> Facts {
             "refusals_spent" => f.refusals_spent = true,
             "refused_by_all" => f.refused_by_all = true,
             "semantic" => f.semantic = true,
+            "elsewhere" => (f.semantic, f.elsewhere, f.begun_repeatable, f.retries_left) = (true, true, true, true),
             "held" => f.held = true,
             "accepted" => f.accepted = true,
             other => panic!("no fact {other}"),

@@ -178,6 +178,19 @@ async fn a_robot_that_hears_and_does_not_answer_is_passed_over_at_once_and_broke
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_robot_that_calls_offers_over_is_passed_over_like_one_that_refuses_them() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").answer = Answer::CallOver;
+    w.submit("T1", "A", "B").await;
+    let seen = w.until("it is broken off", |s| !s.open_incidents("ROBOT_DOES_NOT_ANSWER").is_empty()).await;
+    assert_eq!(seen.task("T1").epoch, 5);
+    w.r("r1").answer = Answer::Accept;
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn offers_that_never_arrived_count_against_nobody() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;

@@ -1,11 +1,12 @@
 //! Faults: what is tried again, what a person hears of, and when a robot is taken out of dispatch.
 
-use crate::harness::{World, jam, obstacle};
+use crate::harness::{Answer, World, jam, obstacle};
 use midshift_core::reason::Code;
 use midshift_core::robot::Duty;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
 use midshift_core::task::raw::RawRetry;
+use midshift_core::work::WorkState;
 use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
@@ -159,5 +160,111 @@ async fn a_robot_without_progress_is_stopped_but_not_while_it_waits_for_a_place(
     assert_eq!(seen.reason("T1"), Some(Code::Stalled));
     w.r("r1").works = true;
     w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_task_that_a_robot_failed_is_kept_a_minute_for_another_that_is_busy() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("near", "park-a").await;
+    w.robot("other", "park-b").await;
+    w.pass(2).await;
+    w.r("other").drives = false;
+    w.submit_with("T1", "A", "B", |raw| {
+        raw.robot_id = "other".to_owned();
+        raw.stall_ms = Some(3_600_000);
+    })
+    .await;
+    w.until_phase("T1", Phase::Running).await;
+    w.r("near").fails = Some((0, obstacle()));
+    w.submit_with("T2", "A", "B", |raw| raw.retry = twice()).await;
+    w.until("it waits again", |s| s.phase("T2") == Phase::Queued && s.task("T2").epoch == 1).await;
+    w.pass_while(50, "it is kept for the other", |s| s.phase("T2") == Phase::Queued).await;
+    let seen = w.until("it is given again", |s| s.task("T2").epoch == 2).await;
+    assert_eq!(seen.robot_of("T2").as_deref(), Some("near"), "nobody else was free");
+    w.lawful().await;
+}
+
+/// Beside a robot that ends whatever it takes an honest one does four tasks, and the first is broken off. Gives back how
+/// many of them it had.
+async fn beside_one_that_ends(state: WorkState) -> usize {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("near", "park-a").await;
+    w.robot("other", "park-b").await;
+    w.pass(2).await;
+    w.r("near").answer = Answer::LetGo(state);
+    let tasks = ["T1", "T2", "T3", "T4"];
+    for id in tasks {
+        w.submit_with(id, "A", "B", |raw| raw.retry = twice()).await;
+    }
+    for id in tasks {
+        let seen = w.until("it is over", |s| s.phase(id).is_terminal() || s.phase(id) == Phase::NeedsOperator).await;
+        assert_eq!((seen.phase(id), seen.robot_of(id).as_deref()), (Phase::Succeeded, Some("other")), "{state:?} {id}");
+        assert!(seen.task(id).epoch <= 2, "{state:?} {id}: passed over once it failed");
+    }
+    let seen = w.seen().await;
+    assert_eq!(seen.control("near").duty(), Duty::BrokenOff, "{state:?}");
+    assert_eq!(seen.incidents(), [Code::RobotBreakerOpened], "{state:?}");
+    assert!(seen.control("other").failures.is_empty(), "{state:?}");
+    w.lawful().await;
+    tasks.into_iter().filter(|id| !seen.task(id).failed_robots.is_empty()).count()
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_takes_work_and_lets_it_go_is_broken_off_and_keeps_no_task_from_another() {
+    for state in [WorkState::Aborted, WorkState::Suspended, WorkState::Refused] {
+        assert_eq!(beside_one_that_ends(state).await, 3, "{state:?}: the third opens its breaker");
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_a_robot_calls_impossible_another_does_and_three_that_others_did_break_it_off() {
+    assert_eq!(beside_one_that_ends(WorkState::Failed).await, 3);
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_two_robots_call_impossible_goes_to_a_person_and_counts_against_neither() {
+    let mut w = World::on(CORRIDOR).await;
+    for (robot, at) in [("r1", "park-a"), ("r2", "park-b")] {
+        w.robot(robot, at).await;
+        w.r(robot).answer = Answer::LetGo(WorkState::Failed);
+    }
+    w.pass(2).await;
+    for id in ["T1", "T2", "T3"] {
+        w.submit_with(id, "A", "B", |raw| raw.retry = twice()).await;
+        let seen = w.until_phase(id, Phase::NeedsOperator).await;
+        assert_eq!((seen.reason(id), seen.task(id).epoch), (Some(Code::FaultNotRecoverable), 2));
+    }
+    assert!(w.seen().await.incidents().is_empty());
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_the_only_robot_calls_impossible_goes_to_a_person_at_once() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").answer = Answer::LetGo(WorkState::Failed);
+    w.submit_with("T1", "A", "B", |raw| raw.retry = twice()).await;
+    let seen = w.until_phase("T1", Phase::NeedsOperator).await;
+    assert_eq!((seen.reason("T1"), seen.task("T1").epoch), (Some(Code::FaultNotRecoverable), 1));
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_a_robot_lets_go_after_it_came_anew_does_not_count_against_it() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").drives = false;
+    w.submit("T1", "A", "B").await;
+    for epoch in 1..=3 {
+        let seen = w.until("it runs", |s| s.phase("T1") == Phase::Running && s.task("T1").epoch == epoch).await;
+        w.connect("r1").await;
+        w.r("r1").forgets_its_work();
+        w.r("r1").reports(seen.task("T1").attempt_id().expect("an attempt"), WorkState::Aborted);
+        w.until_phase("T1", Phase::RetryWait).await;
+    }
+    w.r("r1").drives = true;
+    let seen = w.until_phase("T1", Phase::Succeeded).await;
+    assert!(seen.control("r1").failures.is_empty());
     w.lawful().await;
 }

@@ -21,6 +21,10 @@ pub enum Answer {
     Accept,
     Refuse(Code),
     Ignore,
+    /// It takes it and says in the same breath that it ended so; FAILED: because the work cannot be done as asked.
+    LetGo(WorkState),
+    /// It says that it is over, and never took it.
+    CallOver,
 }
 
 pub struct Robot {
@@ -102,6 +106,15 @@ pub fn jam() -> Fault {
         code: midshift_core::robot::FAULT_JAM,
         class: midshift_core::robot::FaultClass::Mechanical,
         message: "stuck".to_owned(),
+    }
+}
+
+/// A fault that says that the work cannot be done as asked.
+fn impossible() -> Fault {
+    Fault {
+        code: midshift_core::robot::FAULT_SEMANTIC,
+        class: midshift_core::robot::FaultClass::Semantic,
+        message: "not as asked".to_owned(),
     }
 }
 
@@ -416,16 +429,26 @@ impl Robot {
         }
         let anchored = self.sent.check(&new.offer, now.link).is_ok();
         match self.answer {
-            Answer::Accept if anchored => {
-                self.at = 0;
-                self.step = new.from_step;
-                self.tell(&new.attempt, WorkState::Accepted, None, None);
-                self.job = Some(new);
+            Answer::Accept | Answer::LetGo(_) if !anchored => self.refuse(&new.attempt, Code::StaleAuthority),
+            Answer::Accept => self.accept(new),
+            Answer::LetGo(state) => {
+                self.accept(new);
+                self.end(state, (state == WorkState::Failed).then(impossible));
             }
-            Answer::Accept => self.refuse(&new.attempt, Code::StaleAuthority),
+            Answer::CallOver => {
+                self.finished.insert(new.attempt.clone());
+                self.tell(&new.attempt, WorkState::Aborted, None, None);
+            }
             Answer::Refuse(code) => self.refuse(&new.attempt, code),
             Answer::Ignore => {}
         }
+    }
+
+    fn accept(&mut self, new: Assignment) {
+        self.at = 0;
+        self.step = new.from_step;
+        self.tell(&new.attempt, WorkState::Accepted, None, None);
+        self.job = Some(new);
     }
 
     fn refuse(&mut self, attempt: &AttemptId, code: Code) {
