@@ -587,6 +587,13 @@ mod tests {
     }
 
     #[test]
+    fn every_reason_behind_a_closed_place_names_what_opens_it() {
+        for code in [Code::PlaceBlocked, Code::PlaceQuarantined, Code::UncertainTooLong, Code::RobotDroppedIt] {
+            assert!(code.next_step().contains("midshift zone clear PLACE"), "{code}");
+        }
+    }
+
+    #[test]
     fn a_row_with_a_reason_of_a_newer_version_is_read_shown_and_written_back_whole() {
         let row = r#"{"code":"GRAVITY_LOST","message":"it floats","metadata":{"robot_id":"rbt-01"}}"#;
         let reason: Reason = serde_json::from_str(row).expect("a reason");

@@ -186,7 +186,7 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
     let kept = || screen::robot(view, board, robot_id, now).err().or_else(|| carries(view, board, robot_id));
     let barred = || {
         let closed: Option<Vec<&Reason>> = candidates.iter().map(|c| barring(c.reason.as_ref())).collect();
-        closed.and_then(|closed| closed.first().map(|why| (*why).clone()))
+        closed.and_then(|closed| closed.first().copied().cloned())
     };
     let verdict = standing::of_robot(view, board, now, robot_id).or_else(kept).or_else(barred);
     let verdict = verdict.map(|why| standing::about_robot(why, robot_id));
