@@ -234,7 +234,8 @@ codes! {
     WorkUnreadable = "WORK_UNREADABLE", "The robot cannot read the work that it was sent and acts as if its authority had ended. Its software is too old for this server, or the other way round.";
     AssignmentUnlawful = "ASSIGNMENT_UNLAWFUL", "The record of the task names a step that it does not have, so the robot was not sent it. A person must resolve the task.";
     RouteTooLong = "ROUTE_TOO_LONG", "The way through all goals of the task has more points than a robot takes. Split the task.";
-    PlaceBlocked = "PLACE_BLOCKED", "A place on the way is quarantined. A person must look and clear it.";
+    PlaceBlocked = "PLACE_BLOCKED", "A place on the way is held by another robot, or closed because nobody knows what a robot does there."
+        => "`midshift zone ls --in-use` shows who holds it. If it is closed, look there, then `midshift zone clear PLACE --reason TEXT --if-match ETAG`.";
     ExcludedAfterFailure = "EXCLUDED_AFTER_FAILURE", "The robot failed this task and the task asks for another.";
     BoundElsewhere = "BOUND_ELSEWHERE", "The task is opened: its item is on another robot.";
     // --- why a task waits or ended
@@ -263,8 +264,10 @@ codes! {
     LeaseOver = "LEASE_OVER", "The robot was not heard for longer than its authority.";
     ManualMode = "MANUAL_MODE", "A person took the robot over.";
     StepUnknown = "STEP_UNKNOWN", "The robot restarted inside a step that must not be done twice.";
-    UncertainTooLong = "UNCERTAIN_TOO_LONG", "Nobody could say for five minutes what the robot did.";
-    RobotDroppedIt = "ROBOT_DROPPED_IT", "The robot no longer has the attempt.";
+    UncertainTooLong = "UNCERTAIN_TOO_LONG", "Nobody could say for five minutes what the robot did. Places in which it may be stay closed until it is heard."
+        => "Look at the robot, then `midshift task resolve TASK` and for each place that `midshift incident ls` names `midshift zone clear PLACE --reason TEXT --if-match ETAG`.";
+    RobotDroppedIt = "ROBOT_DROPPED_IT", "The robot no longer has the attempt."
+        => "If a place stays closed, `midshift incident ls` names it: look there, then `midshift zone clear PLACE --reason TEXT --if-match ETAG`.";
     Forced = "FORCED", "A person ended it by force; robot and places stay kept until the robot reports.";
     CanceledByUser = "CANCELED_BY_USER", "A person or program canceled it.";
     ResolvedByUser = "RESOLVED_BY_USER", "A person resolved it.";
@@ -389,7 +392,8 @@ codes! {
     StoreBehindRobot = "STORE_BEHIND_ROBOT", "The robot says that it has applied a newer generation than this store gave: the store was restored from a backup, or the robot errs.";
     TaskBacklog = "TASK_BACKLOG", "Ready tasks wait for a robot for more than an hour. It closes by itself. `midshift task ls --state queued` lists them.";
     RobotBreakerOpened = "ROBOT_BREAKER_OPENED", "A robot failed three attempts in ten minutes.";
-    PlaceQuarantined = "PLACE_QUARANTINED", "A place is kept closed until the robot inside reports or a person clears it.";
+    PlaceQuarantined = "PLACE_QUARANTINED", "A place, or a seat of it, is kept closed until the robot that may be inside reports or a person clears it."
+        => "Look there, then `midshift zone clear PLACE --reason TEXT --if-match ETAG`; `midshift zone ls` shows the ETAG.";
     HoldByPerson = "HOLD_BY_PERSON", "A person asked for a pause.";
     HoldByStop = "HOLD_BY_STOP", "A fleet stop stopped the robot. Reset it, then resume what it held.";
     HoldByBody = "HOLD_BY_BODY", "The robot's own safety system stopped it.";
@@ -579,6 +583,13 @@ mod tests {
         let answers = Code::ALL.iter().copied().take_while(|code| *code != Code::RobotPinnedElsewhere);
         for code in answers.chain(reasons) {
             assert!(!code.next_step().is_empty() && code.help().ends_with(code.next_step()), "{code}");
+        }
+    }
+
+    #[test]
+    fn every_reason_behind_a_closed_place_names_what_opens_it() {
+        for code in [Code::PlaceBlocked, Code::PlaceQuarantined, Code::UncertainTooLong, Code::RobotDroppedIt] {
+            assert!(code.next_step().contains("midshift zone clear PLACE"), "{code}");
         }
     }
 

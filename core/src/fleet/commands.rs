@@ -14,16 +14,11 @@ use crate::reason::{Code, Kind, Reason, Refusal, Violations};
 use crate::robot::Presence;
 use crate::rows::{Item, Record, Revision, Writer};
 use crate::task::raw::check_labels;
+use crate::time::Now;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Checks a command against what is known; an error changes nothing.
-pub fn check(
-    view: &View,
-    board: &Board,
-    now: &crate::time::Now,
-    command: &Command,
-    seen: Option<Revision>,
-) -> Result<(), Refusal> {
+pub fn check(view: &View, board: &Board, now: &Now, command: &Command, seen: Option<Revision>) -> Result<(), Refusal> {
     let current = match command {
         Command::Cordon { robot_id, .. }
         | Command::Uncordon { robot_id }
@@ -67,18 +62,7 @@ pub fn check(
             let Some(row) = view.places.get(place_id.as_str()) else {
                 return Err(Refusal::new(Kind::NotFound, Reason::from(Code::PlaceNotFound).with("place_id", place_id)));
             };
-            // One inside is believed while it is heard; one that may still enter is let go only when its permission must be over.
-            let may_be_there = |h: &&PlaceHolder| match heard::presence(board, &h.robot_id, now) {
-                Presence::Online => true,
-                Presence::Suspect | Presence::Updating => h.state != HolderState::Inside,
-                Presence::Offline => false,
-            };
-            if let Some(h) = row.row.holders.iter().find(may_be_there) {
-                return Err(Refusal::new(
-                    Kind::Precondition,
-                    Reason::from(Code::PlaceNotClear).with("robot_id", &h.robot_id),
-                ));
-            }
+            may_clear(board, now, &row.row)?;
             row.revision
         }
         Command::CloseIncident { incident_id, .. } => {
@@ -93,6 +77,48 @@ pub fn check(
         }
         _ => Ok(()),
     }
+}
+
+/// One inside is believed while it is heard; one that may still enter is let go only when its permission must be over.
+fn may_be_there(board: &Board, now: &Now, holder: &PlaceHolder) -> bool {
+    match heard::presence(board, &holder.robot_id, now) {
+        Presence::Online => true,
+        Presence::Suspect | Presence::Updating => holder.state != HolderState::Inside,
+        Presence::Offline => false,
+    }
+}
+
+/// A place of one seat is not cleared while a robot may be there; of one with more seats, those of robots that are not heard are.
+fn may_clear(board: &Board, now: &Now, place: &Place) -> Result<(), Refusal> {
+    let is_there = |h: &&PlaceHolder| may_be_there(board, now, h);
+    let is_shared = place.capacity > 1;
+    let Some(first) = place.holders.iter().find(is_there) else { return Ok(()) };
+    if is_shared && !place.holders.iter().all(|h| may_be_there(board, now, h)) {
+        return Ok(());
+    }
+    let (robot_id, place_id) = (&first.robot_id, &place.place_id);
+    let told = match first.state {
+        HolderState::Inside => format!("{robot_id} is heard and stands in {place_id}."),
+        HolderState::Granted | HolderState::Revoking => format!("{robot_id} may be on its way into {place_id}."),
+    };
+    let reason = Reason::new(Code::PlaceNotClear, told).with("robot_id", robot_id).with("place_id", place_id);
+    Err(Refusal::new(Kind::Precondition, reason))
+}
+
+/// Lets go of what a person has seen empty. A robot that may be there keeps its seat, and what is closed because of it stays closed.
+fn clear(tx: &mut Tx, board: &Board, place: Place) {
+    let now = tx.now;
+    let (kept, gone): (Vec<_>, Vec<_>) = place.holders.into_iter().partition(|h| may_be_there(board, &now, h));
+    let mut cleared = place.cleared;
+    cleared.extend(gone.iter().map(|holder| holder.grant_id).filter(|id| *id != 0));
+    cleared.drain(..cleared.len().saturating_sub(limits::CLAIMED_PLACES_MAX));
+    let is_of_kept = |closed: &Reason| {
+        let robot_id = closed.metadata.get("robot_id");
+        kept.iter().any(|holder| robot_id.is_some_and(|id| *id == holder.robot_id.as_str()))
+    };
+    let quarantine = place.quarantine.filter(is_of_kept);
+    let (place_id, capacity, standing) = (place.place_id, place.capacity, place.standing);
+    tx.put(Place { place_id, capacity, standing, holders: kept, quarantine, cleared }, "place.cleared");
 }
 
 /// What people may say of a robot is what it may say of itself.
@@ -126,13 +152,7 @@ fn relabeled(
 
 /// An attempt is ignored only while its robot is heard, stands still, lists it as its own, and no row knows it: not right after it turned out to
 /// know more than a restored store.
-fn may_disown(
-    view: &View,
-    board: &Board,
-    now: &crate::time::Now,
-    robot_id: &RobotId,
-    attempt: &AttemptId,
-) -> Result<(), Refusal> {
+fn may_disown(view: &View, board: &Board, now: &Now, robot_id: &RobotId, attempt: &AttemptId) -> Result<(), Refusal> {
     let no = |what: &str| {
         let reason = Reason::new(Code::NotAllowedNow, what).with("robot_id", robot_id).with("attempt", attempt);
         Err(Refusal::new(Kind::Precondition, reason))
@@ -246,10 +266,7 @@ pub fn apply(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
         Command::ClearPlace { place_id, reason } => {
             tx.tell(place_id.as_str(), "place.judged_clear", &serde_json::json!({"actor": actor, "reason": reason}));
             let Some(place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
-            let mut cleared = place.cleared.clone();
-            cleared.extend(place.holders.iter().map(|holder| holder.grant_id).filter(|id| *id != 0));
-            cleared.drain(..cleared.len().saturating_sub(limits::CLAIMED_PLACES_MAX));
-            tx.put(Place { holders: Vec::new(), quarantine: None, cleared, ..place }, "place.cleared");
+            clear(tx, board, place);
         }
         Command::CloseIncident { incident_id, reason } => incidents::close(tx, incident_id, reason, actor),
     }

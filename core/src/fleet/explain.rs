@@ -2,7 +2,7 @@
 
 use super::standing::{self, WAITS_FOR};
 use super::view::View;
-use super::{Board, load, screen, way};
+use super::{Board, closures, load, screen, way};
 use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -55,6 +55,7 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
     let robots = waits.then(|| screened(view, board, now));
     for (robot_id, against) in robots.into_iter().flatten() {
         let reason = screen::pair(view, board, robot_id, task, intake, now).err().or_else(|| against.clone());
+        let reason = reason.map(|why| closures::name_closed(view, why));
         if let Some(reason) = &reason {
             *filtered.entry(reason.code).or_default() += 1;
         }
@@ -74,9 +75,16 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
         Some(pinned) => candidates.iter().find(|c| c.robot_id == *pinned).map_or_else(|| absent(pinned), awaited),
         None => candidates.first().map_or_else(|| "a robot: none has connected".to_owned(), awaited),
     };
+    let closed = candidates.iter().find_map(|c| barring(c.reason.as_ref())).filter(|_| !eligible).cloned();
     candidates.truncate(CANDIDATES_MAX);
     let code = if eligible { Code::WaitingInQueue } else { Code::WaitingForRobot };
-    let turn = || waits_for_turn(view, task_id, now, code).with(WAITS_FOR, awaited);
+    let turn = || {
+        let why = waits_for_turn(view, task_id, now, code).with(WAITS_FOR, awaited);
+        closed.into_iter().fold(why, |mut why, closed| {
+            why.message = format!("{} {}", why.text(), closed.text());
+            why
+        })
+    };
     let verdict = standing::of_task(view, board, now, task, intake).or_else(|| waits.then(turn));
     let verdict = verdict.or_else(|| task.reason.clone());
     Some(TaskExplanation { position, verdict, candidates, filtered })
@@ -165,7 +173,8 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
         let intake = view.intake(task_id)?;
         let reason = screen::task(view, board, task, intake, now)
             .and_then(|()| screen::pair(view, board, robot_id, task, intake, now))
-            .err();
+            .err()
+            .map(|why| closures::name_closed(view, why));
         let goal = intake
             .spec
             .next_goal(way::from_step(&intake.spec.steps, task.next_step) as usize)
@@ -173,10 +182,20 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
         let distance_mm = at.zip(goal).and_then(|(at, goal)| view.router.distance_mm(at, goal));
         Some(TaskCandidate { task_id: task_id.clone(), reason, distance_mm })
     });
+    let candidates: Vec<TaskCandidate> = candidates.collect();
     let kept = || screen::robot(view, board, robot_id, now).err().or_else(|| carries(view, board, robot_id));
-    let verdict = standing::of_robot(view, board, now, robot_id).or_else(kept);
+    let barred = || {
+        let closed: Option<Vec<&Reason>> = candidates.iter().map(|c| barring(c.reason.as_ref())).collect();
+        closed.and_then(|closed| closed.first().copied().cloned())
+    };
+    let verdict = standing::of_robot(view, board, now, robot_id).or_else(kept).or_else(barred);
     let verdict = verdict.map(|why| standing::about_robot(why, robot_id));
-    Some(RobotExplanation { verdict, candidates: candidates.collect() })
+    Some(RobotExplanation { verdict, candidates })
+}
+
+/// The reason, if it names a closed place that bars the way.
+fn barring(why: Option<&Reason>) -> Option<&Reason> {
+    why.filter(|why| why.code == Code::PlaceBlocked && !why.message.is_empty())
 }
 
 /// The robot carries what is of no task that waits for it, or of one that waits for a person, or what a person has put back.

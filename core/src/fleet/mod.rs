@@ -2,7 +2,7 @@
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
 //! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `plausible`, `claims`, `answers`, `commands` (`asked`: which there are) are what happens; `tasks` moves tasks by
-//! the table and `breaker` counts what robots fail; `heard`, `anchor`, `attempts`, `incidents` and `refused` are what they share; `queue`, `screen`, `pool` and `assign` give work, in turns cut by `slice`; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `standing` says what is done or waited for, `explain` tells people, `unexplained` counts what nobody can say, `lasting` opens incidents of robots that stand for long; `maps` says what a changed map waits for.
+//! the table and `breaker` counts what robots fail; `heard`, `anchor`, `attempts`, `incidents` and `refused` are what they share; `queue`, `screen`, `pool` and `assign` give work, in turns cut by `slice`; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `standing` says what is done or waited for, `explain` tells people, `unexplained` counts what nobody can say, `lasting` opens incidents of robots that stand for long, `closures` of places that are closed; `maps` says what a changed map waits for.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
@@ -14,6 +14,7 @@ pub mod breaker;
 pub mod budget;
 pub mod bugs;
 pub mod claims;
+pub mod closures;
 pub mod commands;
 pub mod desired;
 pub mod drain;
@@ -413,6 +414,7 @@ pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Pl
         plan.slice.renew();
         unexplained::count_unexplained(view, board, now, plan);
         lasting::tell_lasting(view, board, now, plan);
+        closures::tell_closed(view, now, plan);
     }
     if !plan.items.is_empty() {
         tell_time(view, now, plan);

@@ -7,10 +7,10 @@
 //! Called by `explain` for people, and by `unexplained`, which counts what has no reason.
 
 use super::queue::Wait;
-use super::rows::RobotHolder;
+use super::rows::{Place, RobotHolder};
 use super::stops::Hold;
 use super::view::View;
-use super::{Board, claims, heard, places, plausible, screen, starts, stopped};
+use super::{Board, claims, closures, heard, places, plausible, screen, starts, stopped};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::{Code, Reason};
 use crate::robot::{HardwareStop, Mode, Presence, WorkState};
@@ -21,6 +21,9 @@ use std::collections::BTreeSet;
 
 /// The fact of a reason that names what is waited for.
 pub const WAITS_FOR: &str = "waits_for";
+
+/// The fact that names places which are closed.
+const SHUT: &str = "quarantined";
 
 /// Whether a reason says what is done, or names what it waits for.
 pub fn is_told(reason: &Reason) -> bool {
@@ -256,8 +259,8 @@ pub fn of_robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Op
     }
 }
 
-/// Which places the robot waits for, and what is in the way: holders, robots that start there, a stop, a quarantine, whoever came first, or
-/// an area that is full. None: it waits for none.
+/// Which places the robot waits for, and what is in the way: a place that is closed, holders of one without a free seat, robots that start
+/// there, a stop, whoever came first, an area that is full, or a free seat that others go to first. None: it waits for none.
 pub fn place_wait(view: &View, robot_id: &RobotId) -> Option<Reason> {
     let wait = view.waits.get(robot_id)?;
     let mut reason = Reason::from(Code::PlaceBlocked);
@@ -270,6 +273,10 @@ pub fn place_wait(view: &View, robot_id: &RobotId) -> Option<Reason> {
             reason.message = told.to_owned();
             let places = wait.places.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
             reason = reason.with(WAITS_FOR, format!("{places}: {} {}", key.replace('_', " "), names.join(", ")));
+            if key == SHUT {
+                let closure = names.iter().find_map(|id| closures::of(view, &view.places.get(*id)?.row));
+                reason = closure.into_iter().fold(reason, |reason, closure| closure.tell(reason));
+            }
         }
         reason = reason.with(key, names.join(" "));
     }
@@ -282,7 +289,7 @@ fn in_the_way(
     view: &View,
     robot_id: &RobotId,
     places: &[PlaceId],
-) -> [(&'static str, &'static str, BTreeSet<String>); 6] {
+) -> [(&'static str, &'static str, BTreeSet<String>); 7] {
     let rows = || places.iter().filter_map(|id| view.places.get(id.as_str())).map(|p| &p.row);
     let known = || places.iter().filter_map(|id| view.site.find_place(id));
     let others = |id: &&RobotId| *id != robot_id;
@@ -293,22 +300,26 @@ fn in_the_way(
     let areas = known().filter_map(|ix| view.site.place(ix).waypoint()).map(|at| &view.site.area_of(at).area_id);
     let inside: BTreeSet<RobotId> = areas.flat_map(|area| places::robots_in_area(view, area)).collect();
     let closed = stopped::closed(view);
-    let is_shut = |p: &&super::rows::Place| p.quarantine.is_some() || view.refused.is_place_aside(&p.place_id);
+    let has_seat = |p: &Place| {
+        let known = view.site.find_place(&p.place_id);
+        known.is_some_and(|ix| starts::taken(view, ix, p, robot_id) < p.capacity as usize)
+    };
+    let misses_a_seat = |p: &Place| !has_seat(p) && closures::of(view, p).is_some();
+    let is_shut = |p: &&Place| p.quarantine.is_some() || view.refused.is_place_aside(&p.place_id) || misses_a_seat(p);
+    let holders = |seat: bool| -> BTreeSet<String> {
+        names(&mut rows().filter(|p| has_seat(p) == seat).flat_map(|p| &p.holders).map(|h| &h.robot_id))
+    };
     [
         (
-            "held_by",
-            "waits for a place that another robot holds",
-            names(&mut rows().flat_map(|p| &p.holders).map(|h| &h.robot_id)),
+            SHUT,
+            "waits for a place that is closed until a person clears it",
+            rows().filter(is_shut).map(|p| p.place_id.to_string()).collect(),
         ),
+        ("held_by", "waits for a place that another robot holds", holders(false)),
         (
             "kept_for",
             "waits for a place that is kept for a robot that starts there and was not heard yet",
             names(&mut known().flat_map(|ix| starts::awaited(view, ix))),
-        ),
-        (
-            "quarantined",
-            "waits for a place that is closed until a person clears it",
-            rows().filter(is_shut).map(|p| p.place_id.to_string()).collect(),
         ),
         (
             "stopped",
@@ -321,5 +332,6 @@ fn in_the_way(
             "waits for a place in an area that has as many robots as can move there",
             names(&mut inside.iter()),
         ),
+        ("beside", "waits for a place that has a free seat and is kept for others", holders(true)),
     ]
 }

@@ -5,7 +5,7 @@
 
 use super::Tx;
 use super::rows::{HolderState, RobotAuthority, RobotCounter, RobotHolder, Timer, TimerKind};
-use super::{attempts, breaker, plausible, screen};
+use super::{attempts, breaker, closures, plausible, screen};
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -254,10 +254,12 @@ pub fn revoke_unentered(tx: &mut Tx, robot_id: &RobotId) {
     }
 }
 
+/// Closes the places in which the robot may be; where it was only let in it keeps its own seat, and the others go on.
 fn quarantine(tx: &mut Tx, robot_id: &RobotId, why: Option<&Reason>) {
     for id in places_of(tx, robot_id) {
         let Some(mut place) = tx.view.places.get(&id).map(|p| p.row.clone()) else { continue };
-        if place.quarantine.is_none() {
+        let is_whole = place.holder(robot_id).is_some_and(|holder| closures::is_whole(&place, holder));
+        if place.quarantine.is_none() && is_whole {
             let cause = why.map_or(Code::Forced, |r| r.code);
             place.quarantine =
                 Some(Reason::from(Code::PlaceQuarantined).with("robot_id", robot_id).with("cause", cause));

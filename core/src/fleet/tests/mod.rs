@@ -1,6 +1,7 @@
 //! A picture with robots that stand idle and tasks that wait, for tests of one cycle.
 
 mod backlog;
+mod closures;
 mod drains;
 mod energy;
 mod incidents;

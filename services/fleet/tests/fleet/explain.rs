@@ -229,6 +229,27 @@ async fn a_closed_place_is_the_goal_and_the_task_goes_on_when_it_opens() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn who_has_no_work_but_at_a_closed_place_is_told_by_whom_since_when_and_what_opens_it() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r2", "park-a").await;
+    w.submit("T1", "A", "B").await;
+    w.until("it stands in A", |s| s.holders("A") == [("r2".to_owned(), HolderState::Inside)]).await;
+    w.r("r2").cut();
+    w.cancel("T1", false).await;
+    let seen = w.until("nobody knows where it is", |s| s.place("A").quarantine.is_some()).await;
+    let since = seen.attempt("T1").ended.expect("it was given up").rfc3339();
+    w.robot("r1", "park-b").await;
+    w.submit("T2", "A", "B").await;
+    w.pass(10).await;
+    let robot = of_robot(&w, "r1").await;
+    assert_eq!((robot.code.as_str(), robot.metadata["robots"].as_str()), ("PLACE_BLOCKED", "r2"));
+    for told in [robot, of_task(&w, "T2").await] {
+        let words = ["Place A", "r2", since.as_str(), "`midshift zone clear A --reason TEXT --if-match ETAG`"];
+        assert!(words.iter().all(|word| told.message.contains(word)), "{told:?}");
+    }
+}
+
+#[tokio::test(start_paused = true)]
 async fn the_way_through_its_goals_is_longer_than_a_robot_takes() {
     let mut w = World::on(long_site()).await;
     w.robot("r1", "w0").await;

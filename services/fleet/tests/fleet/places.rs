@@ -449,3 +449,71 @@ async fn an_attempt_that_the_server_does_not_know_is_an_incident_after_a_minute(
     assert!(told.contains("ATTEMPT_UNKNOWN") && told.contains("T-elsewhere/3"), "{told}");
     w.lawful().await;
 }
+
+/// Closed places that people are told of, with how many seats of each.
+fn told_closed(seen: &crate::harness::Seen) -> Vec<(String, String)> {
+    let open = seen.open_incidents("PLACE_QUARANTINED").into_iter().map(|i| i.reason.metadata);
+    open.map(|facts| (facts["place_id"].clone(), facts["seats"].clone())).collect()
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_fell_silent_before_it_entered_keeps_its_seat_and_the_other_seats_are_given() {
+    let narrow = r#"{ id = "B", at = [18000, 3000], kind = "station" }"#;
+    let wide = r#"{ id = "B", at = [18000, 3000], kind = "station", capacity = 3 }"#;
+    assert!(CORRIDOR.contains(narrow));
+    let mut w = World::on(CORRIDOR.replace(narrow, wide).leak()).await;
+    w.robot("r1", "park-a").await;
+    w.submit_with("T1", "A", "B", |raw| raw.stall_ms = Some(3_600_000)).await;
+    let granted = ("r1".to_owned(), HolderState::Granted);
+    w.until("it may enter B", |s| s.holders("B") == [granted.clone()]).await;
+    w.r("r1").drives = false;
+    w.r("r1").cut();
+    w.until("nobody knows", |s| s.is_uncertain("T1")).await;
+    w.pass(298).await;
+    let seen = w.until_phase("T1", Phase::NeedsOperator).await;
+    assert!(seen.place("B").quarantine.is_none() && seen.place("corridor").quarantine.is_some());
+    w.robot("r2", "park-b").await;
+    w.r("r2").works = false;
+    w.submit_with("T2", "B", "park-b", |raw| (raw.robot_id, raw.stall_ms) = ("r2".to_owned(), Some(3_600_000))).await;
+    let inside = ("r2".to_owned(), HolderState::Inside);
+    let both = [granted.clone(), inside.clone()];
+    w.until("r2 is beside the closed seat", |s| s.holders("B") == both).await;
+    let seen = w.until("a person is told", |s| told_closed(s).iter().any(|(id, _)| id == "B")).await;
+    let of_b: Vec<_> = told_closed(&seen).into_iter().filter(|(id, _)| id == "B").collect();
+    assert_eq!(of_b, [("B".to_owned(), "1".to_owned())]);
+    let clear = |w: &World, seen: &crate::harness::Seen| {
+        let (fleet, etag) = (w.fleet.clone(), seen.revision("place_grant", "B").to_string());
+        let (place_id, reason) = ("B".to_owned(), "r1 is not there".to_owned());
+        let request = v1::ClearPlaceRequest { place_id, reason, etag, ..Default::default() };
+        async move { fleet.clear_place(local(request)).await }
+    };
+    clear(&w, &seen).await.expect("r1 is not heard");
+    let seen = w.until("B has a seat more", |s| s.holders("B") == [inside.clone()]).await;
+    let refused = clear(&w, &seen).await.expect_err("r2 is heard");
+    assert_eq!(refused.code(), tonic::Code::FailedPrecondition);
+    assert!(refused.message().contains("r2"), "{refused:?}");
+    w.until("its incident is over", |s| told_closed(s).iter().all(|(id, _)| id != "B")).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_closed_place_has_one_incident_through_restarts_until_its_robot_is_heard() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.submit("T1", "A", "B").await;
+    w.until("it stands in A", |s| s.holders("A") == [("r1".to_owned(), HolderState::Inside)]).await;
+    w.r("r1").cut();
+    w.cancel("T1", false).await;
+    let of_a = |s: &crate::harness::Seen| told_closed(s).into_iter().filter(|(id, _)| id == "A").count();
+    w.until("a person is told", |s| of_a(s) == 1).await;
+    w.stop_fleet().await;
+    w.pass(5).await;
+    w.start_fleet();
+    w.pass_while(90, "told once", |s| of_a(s) == 1).await;
+    let all = w.seen().await.all::<midshift_core::fleet::rows::Incident>();
+    assert_eq!(all.iter().filter(|i| i.reason.metadata.get("place_id").is_some_and(|id| id == "A")).count(), 1);
+    w.r("r1").mend();
+    w.connect("r1").await;
+    w.until("it closes by itself", |s| told_closed(s).is_empty()).await;
+    w.lawful().await;
+}

@@ -11,6 +11,7 @@ use super::explain::verdict;
 use super::lookup::{self, Found, whole_id};
 use super::out::{Format, Out, plain};
 use super::rollout;
+use super::zone;
 use clap::Subcommand;
 use midshift_core::time::Utc;
 use midshift_proto::fleet::v1 as fleet;
@@ -345,6 +346,9 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
             let answer = one.call.fleet().await?.retire_robot(unary(request)).await?.into_inner();
             control(&answer.control.unwrap_or_default(), out)?;
             out.next(&format!("midshift robot uncordon {} brings it back", one.robot_id));
+            if !change.dry_run {
+                zone::tell_kept(&one.call, &one.robot_id, out).await;
+            }
             Ok(())
         }
         Verb::Disown { one, attempt, reason, if_match, change } => {

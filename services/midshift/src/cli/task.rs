@@ -9,6 +9,7 @@ use super::client::{self, Call, Change, Exit, unary};
 use super::explain::verdict;
 use super::lookup::{self, Found};
 use super::out::{Format, Out, plain};
+use super::zone;
 use crate::background::{read_list, request};
 use crate::site_file;
 use clap::{Subcommand, ValueEnum};
@@ -309,6 +310,7 @@ async fn resolve(
     out: &Out,
 ) -> Result<(), Exit> {
     let task = one.read().await?.task.unwrap_or_default();
+    let (robot_id, only) = (task.robot_id.clone(), change.dry_run);
     let request = v1::ResolveTaskRequest {
         task_id: task.task_id,
         request_id: change.request_id,
@@ -319,6 +321,9 @@ async fn resolve(
     };
     let answer = one.call.task().await?.resolve_task(unary(request)).await?.into_inner();
     show(&answer.task.unwrap_or_default(), out)?;
+    if !only {
+        zone::tell_kept(&one.call, &robot_id, out).await;
+    }
     Ok(())
 }
 

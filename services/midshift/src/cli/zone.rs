@@ -1,7 +1,7 @@
 //! `midshift zone …`: passages and standing places.
 
 use super::client::{Call, Change, Exit, unary};
-use super::out::Out;
+use super::out::{Format, Out};
 use clap::Subcommand;
 use midshift_proto::fleet::v1;
 
@@ -37,18 +37,7 @@ pub enum Verb {
 pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
         Verb::Ls { call, in_use } => {
-            let mut client = call.fleet().await?;
-            let mut whole = v1::ListPlacesResponse::default();
-            loop {
-                let request =
-                    v1::ListPlacesRequest { in_use, page_size: 1_000, page_token: whole.next_page_token.clone() };
-                let page = client.list_places(unary(request)).await?.into_inner();
-                whole.places.extend(page.places);
-                whole.next_page_token = page.next_page_token;
-                if whole.next_page_token.is_empty() {
-                    break;
-                }
-            }
+            let whole = list(&call, in_use).await?;
             let header = ["PLACE", "KIND", "SEATS", "HELD BY", "WAITING", "QUARANTINE", "ETAG"];
             out.many(&whole, &whole.places, |p| p.place_id.clone(), &header, row)?;
             Ok(())
@@ -68,6 +57,39 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     }
 }
 
+async fn list(call: &Call, in_use: bool) -> Result<v1::ListPlacesResponse, Exit> {
+    let mut client = call.fleet().await?;
+    let mut whole = v1::ListPlacesResponse::default();
+    loop {
+        let request = v1::ListPlacesRequest { in_use, page_size: 1_000, page_token: whole.next_page_token.clone() };
+        let page = client.list_places(unary(request)).await?.into_inner();
+        whole.places.extend(page.places);
+        whole.next_page_token = page.next_page_token;
+        if whole.next_page_token.is_empty() {
+            return Ok(whole);
+        }
+    }
+}
+
+/// Says which places stay kept for a robot, and how a person opens them. What was asked is done: that this list cannot be had is no error.
+pub async fn tell_kept(call: &Call, robot_id: &str, out: &Out) {
+    if out.format != Format::Table || robot_id.is_empty() {
+        return;
+    }
+    let places = list(call, true).await.map(|whole| whole.places).unwrap_or_default();
+    for place in places.iter().filter(|place| place.holders.iter().any(|h| h.robot_id == robot_id)) {
+        out.next(&kept(place, robot_id));
+    }
+}
+
+fn kept(place: &v1::Place, robot_id: &str) -> String {
+    let (place_id, etag) = (&place.place_id, &place.etag);
+    format!(
+        "{place_id} stays kept for {robot_id} until it is heard and leaves it; if a person has looked and it is gone: \
+         midshift zone clear {place_id} --reason TEXT --if-match {etag}"
+    )
+}
+
 fn row(place: &v1::Place) -> Vec<String> {
     let holder = |h: &v1::PlaceHolder| {
         let state = h.state().as_str_name().trim_start_matches("PLACE_HOLDER_STATE_").to_lowercase();
@@ -83,4 +105,17 @@ fn row(place: &v1::Place) -> Vec<String> {
         place.quarantine.as_ref().map(|q| q.code.clone()).unwrap_or_default(),
         place.etag.clone(),
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_place_that_stays_kept_names_its_robot_and_the_whole_command_that_opens_it() {
+        let place = v1::Place { place_id: "B03".into(), etag: "17".into(), ..v1::Place::default() };
+        let told = kept(&place, "q-1");
+        assert!(told.starts_with("B03 stays kept for q-1"), "{told}");
+        assert!(told.ends_with("midshift zone clear B03 --reason TEXT --if-match 17"), "{told}");
+    }
 }
