@@ -224,6 +224,7 @@ pub fn about_robot(reason: Reason, robot_id: &RobotId) -> Reason {
         | Code::ReportImplausible
         | Code::PlacesImplausible
         | Code::MapDiffers
+        | Code::RobotNotUnderstood
         | Code::AttemptUnknown => format!("a person at robot {robot_id}"),
         _ => format!("robot {robot_id}"),
     };

@@ -7,6 +7,7 @@ mod incidents;
 mod labels;
 mod lasting;
 mod maps;
+mod misreads;
 mod order;
 mod unexplained;
 
