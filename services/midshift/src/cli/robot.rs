@@ -9,7 +9,7 @@ use super::client::{Call, Change, Exit, ended, follow, unary};
 use super::enrol::{self, Machine};
 use super::explain::verdict;
 use super::lookup::{self, Found, whole_id};
-use super::out::{Format, Out, plain};
+use super::out::{Format, Out, few, plain};
 use super::rollout;
 use clap::Subcommand;
 use midshift_core::time::Utc;
@@ -491,7 +491,7 @@ fn control_line(control: &fleet::RobotControl) -> String {
     let holds = if control.hold_tokens.is_empty() {
         String::new()
     } else {
-        format!("  held by {}", control.hold_tokens.join(" "))
+        format!("  held by {}", few(control.hold_tokens.clone()).join(" "))
     };
     let by_word = |word: &fleet::LoadSettled| {
         let is_empty = if word.is_told { "is told that it carries nothing" } else { "carries nothing" };
