@@ -96,7 +96,8 @@ async fn stated(world: &World) -> Result<Vec<serde_json::Value>> {
             let stated = entries.iter().filter(|entry| &*entry.kind == NOT_UNDERSTOOD_SEEN);
             let bodies: Vec<&str> = stated.filter_map(|entry| entry.body.as_deref()).collect();
             if !bodies.is_empty() {
-                return Ok(bodies.into_iter().map(serde_json::from_str).collect::<std::result::Result<_, _>>()?);
+                let read = bodies.into_iter().map(serde_json::from_str::<serde_json::Value>);
+                return Ok(read.collect::<std::result::Result<Vec<_>, _>>()?);
             }
             wake.changed().await?;
         }
