@@ -11,6 +11,12 @@ pub const OFFLINE_AFTER: LinkDuration = LinkDuration::from_secs(31);
 /// Heartbeats with a list that is too long are told of again after this, if there was none that could be read: a person may have closed
 /// what was told of them.
 pub const REPORT_TOO_LONG_TOLD_EVERY: LinkDuration = LinkDuration::from_secs(600);
+/// A robot that is refused so often because what it says cannot be read ...
+pub const MISREADS_TOLD: u32 = 5;
+/// ... within this is a person's matter.
+pub const MISREADS_WITHIN: LinkDuration = LinkDuration::from_secs(60);
+/// Heartbeats of one session after which such a robot is served again: about a minute.
+pub const UNDERSTOOD_AFTER: u64 = 60;
 /// Robot side: authority to go on with an attempt after sending the newest heartbeat that was echoed.
 pub const AUTHORITY: LinkDuration = LinkDuration::from_secs(30);
 /// Server side: the lease over the same authority; 2 % and more above [`AUTHORITY`] for clock drift.

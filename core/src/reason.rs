@@ -224,6 +224,8 @@ codes! {
     DecisionPutAside = "DECISION_PUT_ASIDE", "The store refused the same decision twice, so it is not tried again and the robot or place it is about gets no work and no grant."
         => "The server's log has the details; close the incident to try once more.";
     ReportTooLong = "REPORT_TOO_LONG", "A list of the robot's heartbeat is longer than one may be. It is not processed, so the robot loses its authority; its maker must mend it.";
+    RobotNotUnderstood = "ROBOT_NOT_UNDERSTOOD", "The robot dials and is refused each time, since what it says breaks the robot protocol. It closes by itself."
+        => "Its maker must mend what the reason names.";
     ReportImplausible = "REPORT_IMPLAUSIBLE", "The robot reported a step or an end that cannot be. It frees nothing and moves nothing forward; the robot gets no work while it says so. Look at the robot's software.";
     RobotDoesNotAnswer = "ROBOT_DOES_NOT_ANSWER", "The robot heard three offers within ten minutes and answered none, or refused five in a row. It gets one offer after ten minutes; if it takes that, this ends. Look at its software.";
     OffersNotAnswered = "OFFERS_NOT_ANSWERED", "Many robots did not answer offers at the same time, so none of them is blamed. Look at the server and its network.";

@@ -2,7 +2,7 @@
 
 use super::standing::{self, WAITS_FOR};
 use super::view::View;
-use super::{Board, closures, load, screen, way};
+use super::{Board, closures, load, misreads, screen, way};
 use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -158,9 +158,10 @@ pub struct RobotExplanation {
     pub candidates: Vec<TaskCandidate>,
 }
 
-/// Explains one robot; none if it never connected.
+/// Explains one robot; none if it never connected, nor was refused.
 pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Option<RobotExplanation> {
-    if !view.unknown_rows.names(robot_id) {
+    let refused = misreads::unheard(view, board, now, robot_id);
+    if !view.unknown_rows.names(robot_id) && refused.is_none() {
         view.sessions.get(robot_id.as_str())?;
     }
     if let Err(unread) = view.unknown_rows.screen(robot_id) {
@@ -188,7 +189,7 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
         let closed: Option<Vec<&Reason>> = candidates.iter().map(|c| barring(c.reason.as_ref())).collect();
         closed.and_then(|closed| closed.first().copied().cloned())
     };
-    let verdict = standing::of_robot(view, board, now, robot_id).or_else(kept).or_else(barred);
+    let verdict = refused.or_else(|| standing::of_robot(view, board, now, robot_id)).or_else(kept).or_else(barred);
     let verdict = verdict.map(|why| standing::about_robot(why, robot_id));
     Some(RobotExplanation { verdict, candidates })
 }

@@ -26,6 +26,7 @@ pub mod incidents;
 pub mod lasting;
 pub mod load;
 pub mod maps;
+pub mod misreads;
 pub mod objects;
 pub mod places;
 pub mod plausible;
@@ -211,6 +212,13 @@ pub fn absorb(view: &mut View, now: Now, board: &Board, entries: &[Entry], plan:
                     mark(tx, entry.seq);
                 });
             }
+            (Log::Telemetry, None, _) if &*entry.kind == NOT_UNDERSTOOD_SEEN => {
+                plan.decide(view, now, "fleet", |tx| {
+                    let robot_id = RobotId::parse(&entry.subject).ok();
+                    incidents::open_about(tx, told_by_telemetry(entry), robot_id.as_ref(), "");
+                    mark(tx, entry.seq);
+                });
+            }
             (Log::Ota | Log::Stop, None, Some(body)) if &*entry.kind == crate::maintenance::INCIDENT => {
                 match serde_json::from_str::<Reason>(body) {
                     Ok(reason) => {
@@ -305,18 +313,27 @@ pub const NOT_ENROLLED_SEEN: &str = "session.not_enrolled_seen";
 /// Kind of the fact that a heartbeat had a list longer than one may be and was not processed, stated by telemetry.
 pub const REPORT_TOO_LONG: &str = "session.report_too_long";
 
-/// What telemetry met: the start and certificate of a second machine, the key and certificate of one that is not enrolled, or the list that was too long.
+/// Kind of the fact that a robot dials again and again and is refused because of what it says, stated by telemetry.
+pub const NOT_UNDERSTOOD_SEEN: &str = "session.not_understood_seen";
+
+/// What telemetry met: the start and certificate of a second machine, the key and certificate of one that is not enrolled, the list that was too long, or why
+/// a robot is refused.
 fn told_by_telemetry(entry: &Entry) -> Reason {
     let said: BTreeMap<String, serde_json::Value> =
         entry.body.as_deref().and_then(|body| serde_json::from_str(body).ok()).unwrap_or_default();
     let code = match &*entry.kind {
         CLONE_SEEN => Code::CloneSeen,
         NOT_ENROLLED_SEEN => Code::RobotNotEnrolled,
+        NOT_UNDERSTOOD_SEEN => Code::RobotNotUnderstood,
         _ => Code::ReportTooLong,
     };
     let known =
         ["boot_id", "certificate", "key", "list"].into_iter().filter_map(|key| Some((key, said.get(key)?.as_str()?)));
-    known.fold(code.into(), |reason: Reason, (key, value)| reason.with(key, value))
+    let told = match said.get("why").and_then(|why| why.as_str()) {
+        Some(why) => Reason::new(code, format!("It dials and is refused: {why}.")),
+        None => code.into(),
+    };
+    known.fold(told, |reason, (key, value)| reason.with(key, value))
 }
 
 fn mark(tx: &mut Tx, seq: Seq) {
@@ -415,6 +432,7 @@ pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Pl
         unexplained::count_unexplained(view, board, now, plan);
         lasting::tell_lasting(view, board, now, plan);
         closures::tell_closed(view, now, plan);
+        misreads::close_understood(view, board, now, plan);
     }
     if !plan.items.is_empty() {
         tell_time(view, now, plan);

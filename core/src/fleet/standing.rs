@@ -171,7 +171,7 @@ fn kept(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Result<(),
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
     stopped::screen(view, robot_id, Some(live))?;
     if let Some(hold) = view.robot_holds(robot_id).next() {
-        return Err(held(Code::RobotHeld, &hold.token));
+        return Err(robot_held(&hold.token, robot_id));
     }
     screen::reported(live)?;
     plausible::keeps_back(view, live)?;
@@ -202,6 +202,15 @@ pub fn held(code: Code, token: &str) -> Reason {
     Reason::new(code, told).with("token", token).with(WAITS_FOR, what)
 }
 
+/// The same of a robot, which many stops may hold: they are ended one by one or all at once.
+fn robot_held(token: &str, robot_id: &RobotId) -> Reason {
+    let mut reason = held(Code::RobotHeld, token);
+    if let Some((_, Hold::Resume)) = Hold::read(token) {
+        reason.message += &format!(" `midshift resume --robot {robot_id}` ends all that holds it at once.");
+    }
+    reason
+}
+
 /// A reason that stands against a robot, with whom it waits for.
 pub fn about_robot(reason: Reason, robot_id: &RobotId) -> Reason {
     if is_told(&reason) {
@@ -211,7 +220,7 @@ pub fn about_robot(reason: Reason, robot_id: &RobotId) -> Reason {
     let what = match reason.code {
         Code::StopEngaged => format!("the reset of stop {}", fact("stop_id")),
         Code::RobotDraining => format!("drain {}", fact("drain_id")),
-        Code::RobotHeld => return held(reason.code, &fact("token")),
+        Code::RobotHeld => return robot_held(&fact("token"), robot_id),
         Code::ExclusionBroken => {
             format!("a person at place {} with {} and {robot_id}", fact("place_id"), fact("other"))
         }
@@ -227,6 +236,7 @@ pub fn about_robot(reason: Reason, robot_id: &RobotId) -> Reason {
         | Code::ReportImplausible
         | Code::PlacesImplausible
         | Code::MapDiffers
+        | Code::RobotNotUnderstood
         | Code::AttemptUnknown => format!("a person at robot {robot_id}"),
         _ => format!("robot {robot_id}"),
     };

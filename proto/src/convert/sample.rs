@@ -1,10 +1,11 @@
 //! Samples, gaps and events of the lanes. A sample that cannot be read becomes a poison entry: recorded, acknowledged, never looped on.
 
 use super::stop::{names, stop_ids};
-use super::{At, Parse, WireEnum, counted, from_one, id, maybe, need, permille, text, word};
+use super::{At, Parse, WireEnum, from_one, id, maybe, need, permille, text, word};
 use crate::link::v1;
 use crate::session::LaneBatch;
 use midshift_core::ids::PlaceId;
+use midshift_core::limits;
 use midshift_core::reason::{Reason, Violations};
 use midshift_core::robot::Lane;
 use midshift_core::work::{AttemptReport, Gap, InboxItem, RobotEvent, Sample, SampleBody};
@@ -149,11 +150,20 @@ impl From<&Gap> for v1::Gap {
     }
 }
 
+/// Reads a number in a lane. The next one must be one too: the next Hello says it.
+fn followed(seq: u64, at: At<'_>, bad: &mut Violations) -> Option<u64> {
+    if seq >= limits::COUNTED_MAX {
+        bad.add(at.to_string(), format!("must be below {}", limits::COUNTED_MAX));
+        return None;
+    }
+    from_one(seq, at, bad)
+}
+
 /// A gap has its lane from the batch it stands in.
 impl Parse<(u64, u64, Reason)> for v1::Gap {
     fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<(u64, u64, Reason)> {
         let from_seq = from_one(self.from_seq, at.field("from_seq"), bad);
-        let to_seq = counted(self.to_seq, at.field("to_seq"), bad);
+        let to_seq = followed(self.to_seq, at.field("to_seq"), bad);
         let reason = need(self.reason, at.field("reason"), bad);
         if self.to_seq < self.from_seq {
             bad.add(at.field("to_seq").to_string(), "must not be below from_seq");
@@ -174,7 +184,7 @@ fn first_seq(item: &InboxItem) -> u64 {
 
 /// A sample as the inbox takes it. None: it has no number, which is a fault of the session and not of the sample.
 fn readable(sample: v1::Sample, lane: Lane, at: At<'_>, bad: &mut Violations) -> Option<InboxItem> {
-    let seq = from_one(sample.seq, at.field("seq"), bad)?;
+    let seq = followed(sample.seq, at.field("seq"), bad)?;
     let mut wrong = Violations::default();
     let parsed = sample.parse_at(At::top("sample"), &mut wrong);
     let status = matches!(parsed, Some(Sample { body: SampleBody::Status(_), .. }));

@@ -123,6 +123,9 @@ impl IdentityService {
 
     async fn revoke(&self, r: v1::RevokeRobotRequest, actor: &Caller) -> Result<v1::RevokeRobotResponse, Refusal> {
         let robot_id = robot_of(&r.robot_id)?;
+        if r.reason.len() > limits::REASON_BYTES_MAX {
+            return Err(Refusal::field("reason", format!("must be at most {} bytes", limits::REASON_BYTES_MAX)));
+        }
         let now = self.now();
         let not_found = || Refusal::new(Kind::NotFound, Reason::from(Code::RobotNotFound).with("robot_id", &robot_id));
         let revoked = self.0.register.decide(|view| {
@@ -138,7 +141,7 @@ impl IdentityService {
                     Some(*at),
                     actor,
                     "robot.revoked",
-                    Note::new("robot.revoke").about("robot", &robot_id),
+                    Note::new("robot.revoke").about("robot", &robot_id).because(&r.reason),
                 )),
                 robot,
             ))

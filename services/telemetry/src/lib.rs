@@ -10,6 +10,7 @@ mod event_rate;
 mod events;
 mod grpc;
 mod link;
+mod misreads;
 mod offset;
 mod picture;
 pub mod precision;
@@ -63,6 +64,8 @@ pub(crate) struct Inner {
     pub picture: Picture,
     pub registry: Registry,
     pub event_rates: event_rate::EventRates,
+    /// Robots that are refused because of what they say.
+    pub misreads: misreads::Misreads,
     pub ear: ear::Ear,
     pub shared: Option<shared::Shared>,
     /// Room for robots that say hello.
@@ -85,7 +88,8 @@ impl TelemetryService {
         let shared = parts.heard.clone().map(shared::Shared::new);
         let hellos = Arc::new(Semaphore::new(midshift_core::limits::HELLOS_MAX));
         let (event_rates, moving) = (event_rate::EventRates::default(), CancellationToken::new());
-        let inner = Inner { parts, picture, registry, event_rates, ear, shared, hellos, moving, shutdown };
+        let misreads = misreads::Misreads::default();
+        let inner = Inner { parts, picture, registry, event_rates, misreads, ear, shared, hellos, moving, shutdown };
         Self { inner: Arc::new(inner) }
     }
     /// The robots' face.

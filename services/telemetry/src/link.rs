@@ -1,8 +1,10 @@
 //! The robots' face: reads the Hello, sends the Welcome, runs the session.
 
+use crate::misreads::count_misread;
 use crate::session::{self, Down};
 use crate::{TelemetryService, welcome};
 use midshift_core::identity::Caller;
+use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::time::{LinkDuration, Utc};
@@ -63,7 +65,19 @@ impl TelemetryService {
         mut up: Streaming<v1::SessionRequest>,
         down: Down,
     ) -> Result<(), Refusal> {
-        let hello = hello(&mut up).await?;
+        let first = first(&mut up).await?;
+        let claimed = claimed(&first);
+        let hello = match read(first) {
+            Ok(hello) => hello,
+            Err(refusal) => {
+                if let Some(robot_id) = claimed.filter(|robot_id| by.is_robot(robot_id).is_ok()) {
+                    let why = refusal.reason.text();
+                    tracing::warn!(peer = Empty, %robot_id, why, "a hello was refused");
+                    count_misread(&self.inner, &robot_id, why);
+                }
+                return Err(refusal);
+            }
+        };
         // Before anything is asked about that robot, or done to a session of it.
         by.is_robot(&hello.robot_id)?;
         welcome::check(&self.inner, &hello)?;
@@ -105,7 +119,7 @@ fn crowded(draw: u32) -> Refusal {
 
 struct Leave<'a> {
     service: &'a TelemetryService,
-    robot_id: &'a midshift_core::ids::RobotId,
+    robot_id: &'a RobotId,
     epoch: u64,
     /// Since when; none: in charge.
     observed: Option<Utc>,
@@ -125,17 +139,27 @@ impl Drop for Leave<'_> {
     }
 }
 
-async fn hello(up: &mut Streaming<v1::SessionRequest>) -> Result<Hello, Refusal> {
+async fn first(up: &mut Streaming<v1::SessionRequest>) -> Result<v1::SessionRequest, Refusal> {
     let first = tokio::time::timeout(HELLO_WITHIN, up.message()).await;
     if let Ok(Err(status)) = &first
         && let Some(refusal) = unreadable(status)
     {
         return Err(refusal);
     }
-    let Ok(Ok(Some(message))) = first else {
-        return Err(Refusal::new(Kind::Deadline, Reason::new(Code::ProtocolError, "no hello came")));
-    };
-    match midshift_proto::parse(message)? {
+    match first {
+        Ok(Ok(Some(message))) => Ok(message),
+        _ => Err(Refusal::new(Kind::Deadline, Reason::new(Code::ProtocolError, "no hello came"))),
+    }
+}
+
+/// Who it says that it is, whatever else in it is wrong.
+fn claimed(first: &v1::SessionRequest) -> Option<RobotId> {
+    let Some(v1::session_request::Message::Hello(hello)) = &first.message else { return None };
+    RobotId::parse(&hello.robot_id).ok()
+}
+
+fn read(first: v1::SessionRequest) -> Result<Hello, Refusal> {
+    match midshift_proto::parse(first)? {
         FromRobot::Hello(hello) => Ok(*hello),
         FromRobot::Uplink(_) => Err(Refusal::field("message", "the first message must be a hello")),
     }

@@ -7,6 +7,7 @@ use crate::Inner;
 use crate::enrolment::Waits;
 use crate::event_rate::{self, lock};
 use crate::events::{Batch, Events, Outcome, commit};
+use crate::misreads::count_misread;
 use crate::offset::Offset;
 use crate::picture::Sections;
 use crate::registry::InCharge;
@@ -146,6 +147,10 @@ pub async fn run(
     };
     let end = session.run(&leaving, &mut up, &down, &mut desired).await;
     if let End::Close(close) = end {
+        // Of a session that is only observed nobody knows whether it is the robot.
+        if close.code == CloseCode::Protocol && session.in_charge.is_some() {
+            count_misread(&inner, &robot_id, close.reason.text());
+        }
         let _ = down.try_send(Ok((&ToRobot::Close(close)).into()));
     }
 }
@@ -245,8 +250,8 @@ impl Session {
     /// What the robot sent cannot be read: it hears why, if there still is a stream.
     fn broken(&self, status: &Status) -> End {
         let Some(refusal) = unreadable(status) else { return End::Gone };
-        let code = refusal.reason.code.as_str();
-        tracing::warn!(peer = Empty, robot_id = %self.robot_id, code, "session ended by a message that cannot be read");
+        let (code, why) = (refusal.reason.code.as_str(), refusal.reason.text());
+        tracing::warn!(peer = Empty, robot_id = %self.robot_id, code, why, "session ended by a message that cannot be read");
         End::Close(Close { code: CloseCode::Protocol, reason: refusal.reason, retry_after_ms: 1_000 })
     }
 
@@ -282,8 +287,8 @@ impl Session {
         }
         let read = midshift_proto::parse::<FromRobot, _>(message);
         let Ok(FromRobot::Uplink(Uplink { heartbeat, batches })) = read else {
-            let detail = read.err().map(|e| e.to_string()).unwrap_or_else(|| "a second hello".to_owned());
-            tracing::warn!(peer = Empty, robot_id = %self.robot_id, code = Code::ProtocolError.as_str(), "session ended by a message that breaks its rules");
+            let detail = read.err().map_or_else(|| "a second hello".to_owned(), |e| e.reason.message);
+            tracing::warn!(peer = Empty, robot_id = %self.robot_id, code = Code::ProtocolError.as_str(), why = %detail, "session ended by a message that breaks its rules");
             let reason = Reason::new(Code::ProtocolError, detail);
             return Some(End::Close(Close { code: CloseCode::Protocol, reason, retry_after_ms: 1_000 }));
         };

@@ -302,7 +302,7 @@ impl Player {
         let last = self.produced.entry(ack.lane).or_default();
         *last = (*last).max(ack.seq);
         // It has said itself that no number comes any more: it goes on in another ring.
-        if *last >= limits::COUNTED_MAX {
+        if *last >= limits::COUNTED_MAX - 1 {
             self.drops = true;
             self.format();
         }
@@ -394,7 +394,7 @@ impl Player {
             let lane = batch.lane;
             if let (InboxItem::Sample(sample), true) = (batch.items.remove(at), self.rng.random_bool(0.5)) {
                 let (seq, reason) = (sample.seq, Code::Overflow.into());
-                let to_seq = if self.rng.random_bool(0.05) { limits::COUNTED_MAX } else { seq };
+                let to_seq = if self.rng.random_bool(0.05) { limits::COUNTED_MAX - 1 } else { seq };
                 batch.items.insert(at, InboxItem::Gap(Gap { lane, from_seq: seq, to_seq, reason }));
                 self.kept.retain(|(kept, sample)| *kept != lane || !(seq..=to_seq).contains(&sample.seq));
             }

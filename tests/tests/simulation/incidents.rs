@@ -17,11 +17,12 @@ pub const ASKED: &str = "what a person must solve has an incident";
 pub const NOT_BLAMED: &str = "no honest robot opens an incident of robots that behave badly";
 
 /// What honest robots never bring about.
-const OF_BAD_ROBOTS: [Code; 10] = [
+const OF_BAD_ROBOTS: [Code; 11] = [
     Code::RobotDoesNotAnswer,
     Code::OffersNotAnswered,
     Code::ReportImplausible,
     Code::ReportTooLong,
+    Code::RobotNotUnderstood,
     Code::AttemptUnknown,
     Code::PlacesImplausible,
     Code::ExclusionBroken,

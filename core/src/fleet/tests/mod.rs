@@ -8,6 +8,7 @@ mod incidents;
 mod labels;
 mod lasting;
 mod maps;
+mod misreads;
 mod order;
 mod unexplained;
 

@@ -1,8 +1,8 @@
 //! Hold tokens: the maker's stop holds, its release does not resume, a person does.
 
 use crate::harness::World;
-use midshift_core::fleet::NOT_ENROLLED_SEEN;
 use midshift_core::fleet::rows::HoldToken;
+use midshift_core::fleet::{NOT_ENROLLED_SEEN, NOT_UNDERSTOOD_SEEN};
 use midshift_core::ids::RobotId;
 use midshift_core::reason::Code;
 use midshift_core::robot::HardwareStop;
@@ -163,6 +163,22 @@ async fn a_machine_that_is_not_enrolled_is_one_incident_that_names_its_key() {
     assert_eq!(of.robot_id.as_ref().map(|id| id.as_str()), Some("r2"));
     let metadata = ["key", "certificate"].map(|name| of.reason.metadata.get(name).map(String::as_str));
     assert_eq!(metadata, [Some("abcd"), Some("0a")]);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_is_not_understood_is_one_incident_that_says_why() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    for body in [r#"{"why": "reported.mode: 77"}"#, r#"{"why": "reported.hb: 0"}"#] {
+        w.told_by_telemetry("r2", NOT_UNDERSTOOD_SEEN, body).await;
+    }
+    w.clone_seen("r1").await;
+    let seen = w.until("all are told of", |s| s.incidents().contains(&Code::CloneSeen)).await;
+    let told = seen.open_incidents(Code::RobotNotUnderstood.as_str());
+    let [of] = &told[..] else { panic!("{told:?}") };
+    assert_eq!(of.robot_id.as_ref().map(|id| id.as_str()), Some("r2"));
+    assert_eq!(of.reason.message, "It dials and is refused: reported.mode: 77.");
     w.lawful().await;
 }
 

@@ -85,7 +85,7 @@ async fn a_machine_is_one_robot_and_its_key_lets_no_other_one_in_also_after_it_w
     let other = secret(&identity, "r8", false).await.expect("a secret");
     let refused = enrol(&identity, "r8", &other, &machine).await.expect_err("it is r7");
     assert_eq!(code(&refused), Some(Code::KeyDenied));
-    let revoke = RevokeRobotRequest { robot_id: "r7".to_owned() };
+    let revoke = RevokeRobotRequest { robot_id: "r7".to_owned(), ..Default::default() };
     identity.revoke_robot(local(revoke)).await.expect("revoked");
     let refused = enrol(&identity, "r8", &other, &machine).await.expect_err("it was r7");
     assert_eq!(code(&refused), Some(Code::KeyDenied));
@@ -156,9 +156,14 @@ async fn a_revoked_robot_is_denied_at_once_and_gets_no_new_certificate() {
     let (line, machine) = (secret(&identity, "r7", false).await.expect("a secret"), Machine::new());
     enrol(&identity, "r7", &line, &machine).await.expect("enrolled");
     let key = robot(&identity, "r7").await.key_sha256;
-    let revoke = || local(RevokeRobotRequest { robot_id: "r7".to_owned() });
+    let because = |reason: String| local(RevokeRobotRequest { robot_id: "r7".to_owned(), reason });
+    let revoke = || because("stolen".to_owned());
+    let refused = identity.revoke_robot(because("x".repeat(257))).await.expect_err("too long");
+    assert_eq!(code(&refused), Some(Code::InvalidRequest));
     identity.revoke_robot(revoke()).await.expect("revoked");
     assert!(denies(&identity, &key), "before the answer left");
+    let row = world.audited().await.pop().expect("a row");
+    assert_eq!((row.action.as_str(), row.reason.as_str()), ("robot.revoke", "stolen"));
     identity.revoke_robot(revoke()).await.expect("again: the same answer");
     let own = Caller::robot(RobotId::parse("r7").expect("an id"));
     let request = RenewCertificateRequest { robot_id: "r7".to_owned(), request_pem: machine.request() };

@@ -20,7 +20,7 @@ fn list(world: &World) -> Vec<Revocation> {
 }
 
 async fn revoke_robot(identity: &IdentityService, robot_id: &str) {
-    let request = RevokeRobotRequest { robot_id: robot_id.to_owned() };
+    let request = RevokeRobotRequest { robot_id: robot_id.to_owned(), ..Default::default() };
     identity.revoke_robot(Request::new(request)).await.expect("revoked");
 }
 

@@ -98,9 +98,10 @@ fn quoted(word: &str) -> String {
 }
 
 /// Takes a robot's key out.
-pub async fn revoke(call: &Call, typed: &str, out: &Out) -> Result<(), Exit> {
+pub async fn revoke(call: &Call, typed: &str, reason: String, out: &Out) -> Result<(), Exit> {
     let robot_id = find(call, typed).await?;
-    let revoked = call.identity().await?.revoke_robot(unary(v1::RevokeRobotRequest { robot_id })).await?.into_inner();
+    let request = v1::RevokeRobotRequest { robot_id, reason };
+    let revoked = call.identity().await?.revoke_robot(unary(request)).await?.into_inner();
     let robot = revoked.robot.clone().unwrap_or_default();
     out.one(&revoked, &robot.robot_id, || format!("{} is let in nowhere until it is enrolled anew", robot.robot_id))?;
     out.next(

@@ -165,6 +165,16 @@ fn is_obeyed(c: char) -> bool {
     c.is_control() || matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}' | '\u{200e}' | '\u{200f}')
 }
 
+/// Names that one cell shows.
+const NAMES_SHOWN: usize = 3;
+
+/// The first of some names and how many more there are: what one robot says must not make a table unreadable.
+pub fn few(names: Vec<String>) -> Vec<String> {
+    let more = names.len().saturating_sub(NAMES_SHOWN);
+    let more = (more > 0).then(|| format!("+{more} more"));
+    names.into_iter().take(NAMES_SHOWN).chain(more).collect()
+}
+
 /// Columns as wide as their widest cell.
 pub fn columns(header: &[&str], rows: &[Vec<String>]) -> String {
     let rows: Vec<Vec<Cow<'_, str>>> = rows.iter().map(|row| row.iter().map(|cell| plain(cell)).collect()).collect();
@@ -233,6 +243,13 @@ mod tests {
             (Some("ROBOT  STATE"), 2),
             "the rest is wrapped by the terminal"
         );
+    }
+
+    #[test]
+    fn of_many_names_three_are_shown_and_how_many_more_there_are() {
+        let names = |n: usize| (1..=n).map(|n| format!("S{n}")).collect::<Vec<_>>();
+        assert_eq!([0, 3].map(|n| few(names(n))), [names(0), names(3)]);
+        assert_eq!(few(names(256)).join(", "), "S1, S2, S3, +253 more");
     }
 
     #[test]

@@ -9,7 +9,7 @@ use super::client::{Call, Change, Exit, ended, follow, unary};
 use super::enrol::{self, Machine};
 use super::explain::verdict;
 use super::lookup::{self, Found, whole_id};
-use super::out::{Format, Out, plain};
+use super::out::{Format, Out, few, plain};
 use super::rollout;
 use super::zone;
 use clap::Subcommand;
@@ -203,7 +203,13 @@ pub enum Verb {
         replace: bool,
     },
     /// Take the robot's key out: it is cut off, and let in nowhere until it is enrolled anew.
-    Revoke(One),
+    Revoke {
+        #[command(flatten)]
+        one: One,
+        /// Why, for the audit.
+        #[arg(long, default_value = "")]
+        reason: String,
+    },
     /// Which robots are enrolled, and until when their certificates are good.
     Identities {
         #[command(flatten)]
@@ -243,7 +249,7 @@ impl Verb {
             Self::Pin { one, .. } | Self::Unpin { one, .. } | Self::Exclude { one, .. } => Some(one),
             Self::Load { one, .. } | Self::Unstick { one, .. } | Self::Label { one, .. } => Some(one),
             // A robot that is enrolled needs not have been heard.
-            Self::Revoke(_) | Self::Enroll(_) | Self::Replace { .. } | Self::Adopt { .. } => None,
+            Self::Revoke { .. } | Self::Enroll(_) | Self::Replace { .. } | Self::Adopt { .. } => None,
             Self::Ls { .. } | Self::Watch { .. } | Self::Identities { .. } => None,
         }
     }
@@ -283,7 +289,7 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
             adopt::accept_key(machine.call(), machine.robot_id(), &key, out).await
         }
         Verb::Adopt { call, robot_id, key, replace } => adopt::run(&call, &robot_id, key, replace, out).await,
-        Verb::Revoke(one) => enrol::revoke(&one.call, &one.robot_id, out).await,
+        Verb::Revoke { one, reason } => enrol::revoke(&one.call, &one.robot_id, reason, out).await,
         Verb::Identities { call } => enrol::list(&call, out).await,
         Verb::Cordon { one, reason, if_match, change } => {
             let request = fleet::CordonRobotRequest {
@@ -495,7 +501,7 @@ fn control_line(control: &fleet::RobotControl) -> String {
     let holds = if control.hold_tokens.is_empty() {
         String::new()
     } else {
-        format!("  held by {}", control.hold_tokens.join(" "))
+        format!("  held by {}", few(control.hold_tokens.clone()).join(" "))
     };
     let by_word = |word: &fleet::LoadSettled| {
         let is_empty = if word.is_told { "is told that it carries nothing" } else { "carries nothing" };

@@ -8,7 +8,7 @@ pub use target::address;
 
 use super::client::{Exit, follow, unary, was_cut};
 use super::lookup::{Found, whole_id};
-use super::out::{Format, Out, plain};
+use super::out::{Format, Out, few, plain};
 use crate::stop::{FOLDER, StopServe};
 use crate::way::Line;
 use clap::{Args, Subcommand, ValueEnum};
@@ -517,8 +517,8 @@ fn of_robot(robot: &v1::RobotStatus) -> Vec<String> {
         obeyed,
         stands.to_owned(),
         at(robot.heard_unix_ms),
-        robot.awaiting_resume.join(", "),
-        robot.foreign_stops.join(", "),
+        few(robot.awaiting_resume.clone()).join(", "),
+        few(robot.foreign_stops.clone()).join(", "),
     ]
 }
 
@@ -618,6 +618,15 @@ mod tests {
         for wrong in ["", "--reason drill", "--all --robot r1", "--all status"] {
             assert!(parse(wrong).is_err(), "{wrong}");
         }
+    }
+
+    #[test]
+    fn a_robot_that_names_hundreds_of_stops_has_a_row_that_can_be_read() {
+        let names: Vec<String> = (0..256).map(|n| format!("STOP-{n:040}")).collect();
+        let robot = v1::RobotStatus { awaiting_resume: names.clone(), foreign_stops: names, ..Default::default() };
+        let row = of_robot(&robot);
+        assert!(row.iter().all(|cell| cell.len() < 200) && row[4].ends_with("+253 more"), "{row:?}");
+        assert_eq!(row[4], row[5]);
     }
 
     #[test]

@@ -2,12 +2,15 @@
 
 use crate::raw::Raw;
 use crate::world::{Result, World, hello, world};
+use midshift_core::fleet::NOT_UNDERSTOOD_SEEN;
 use midshift_core::reason::Code;
 use midshift_core::robot::ReportedState;
-use midshift_proto::link::v1::{SessionRequest, SessionResponse};
+use midshift_core::rows::{Log, Seq};
+use midshift_proto::link::v1::{SessionRequest, SessionResponse, session_request};
 use midshift_proto::session::{Close, CloseCode, FromRobot, Heartbeat, ToRobot, Uplink};
 use prost::Message;
 use prost::bytes::Bytes;
+use std::time::Duration;
 use tonic::client::Grpc;
 use tonic::codegen::http::uri::PathAndQuery;
 use tonic::{Request, Streaming};
@@ -68,5 +71,70 @@ async fn a_hello_that_cannot_be_read_is_an_argument_that_is_invalid() -> Result<
         assert_eq!((answer.grpc, answer.code), (tonic::Code::InvalidArgument, Some(Code::ProtocolError)));
         assert!(answer.message.starts_with("a message cannot be read: "), "{}", answer.message);
     }
+    Ok(())
+}
+
+/// The message, in a mode that nobody knows.
+fn in_no_mode(message: &FromRobot) -> Result<Vec<u8>> {
+    let mut request = SessionRequest::from(message);
+    let reported = match &mut request.message {
+        Some(session_request::Message::Hello(hello)) => hello.reported.as_mut(),
+        Some(session_request::Message::Uplink(uplink)) => uplink.heartbeat.as_mut().and_then(|h| h.reported.as_mut()),
+        None => None,
+    };
+    reported.ok_or("it reports nothing")?.mode = 77;
+    Ok(request.encode_to_vec())
+}
+
+/// Waits until something was stated of robots that are not understood, and says what.
+async fn stated(world: &World) -> Result<Vec<serde_json::Value>> {
+    let mut wake = world.store.wake();
+    let stated = async {
+        loop {
+            wake.mark_unchanged();
+            let entries = world.store.feed(Seq(0), &[Log::Telemetry], 1_000).await?.entries;
+            let stated = entries.iter().filter(|entry| &*entry.kind == NOT_UNDERSTOOD_SEEN);
+            let bodies: Vec<&str> = stated.filter_map(|entry| entry.body.as_deref()).collect();
+            if !bodies.is_empty() {
+                let read = bodies.into_iter().map(serde_json::from_str::<serde_json::Value>);
+                return Ok(read.collect::<std::result::Result<Vec<_>, _>>()?);
+            }
+            wake.changed().await?;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(5), stated).await?
+}
+
+/// One robot was stated once, with the field that nobody could read.
+fn is_about_the_mode(stated: &[serde_json::Value]) {
+    let [body] = stated else { panic!("{stated:?}") };
+    let why = body["why"].as_str().unwrap_or_default();
+    assert!(body["robot_id"] == "r1" && why.ends_with("reported.mode: 77 is not a known value"), "{body}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_whose_heartbeats_cannot_be_read_is_stated_once_with_the_field() -> Result<()> {
+    let world = world().await?;
+    let reported = ReportedState { hb: 1, session_epoch: 1, ..ReportedState::default() };
+    let heartbeat = Some(Heartbeat { reported, sent_unix_us: 0, clock: None });
+    let broken = in_no_mode(&FromRobot::Uplink(Uplink { heartbeat, batches: Vec::new() }))?;
+    for _ in 0..6 {
+        let hello = bytes_of(&FromRobot::Hello(Box::new(hello(None)?)));
+        let close = last_word(says(&world, vec![hello, broken.clone()]).await?).await?;
+        assert_eq!((close.code, close.reason.code), (CloseCode::Protocol, Code::ProtocolError));
+    }
+    is_about_the_mode(&stated(&world).await?);
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_whose_hello_cannot_be_read_is_stated_once_with_the_field() -> Result<()> {
+    let world = world().await?;
+    for _ in 0..6 {
+        let broken = in_no_mode(&FromRobot::Hello(Box::new(hello(None)?)))?;
+        let status = says(&world, vec![broken]).await?.message().await.expect_err("nothing began");
+        assert_eq!(status.code(), tonic::Code::InvalidArgument);
+    }
+    is_about_the_mode(&stated(&world).await?);
     Ok(())
 }

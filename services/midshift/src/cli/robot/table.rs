@@ -3,7 +3,7 @@
 //! Invariant: what is not known now is not shown as if it were: it stands in parentheses, with its age beside it.
 
 use crate::cli::client::{Call, Exit, unary};
-use crate::cli::out::{Format, Out};
+use crate::cli::out::{Format, Out, few};
 use crate::way::Line;
 use midshift_core::time::Utc;
 use midshift_proto::convert::{ms_of, time_of};
@@ -111,7 +111,8 @@ fn decided(control: &fleet::RobotControl, now: Option<Utc>) -> Vec<String> {
     let breaker = control.breaker_open_time.as_ref().map(|at| format!("broken off{}", since(Some(at), now)));
     let retired = control.retired.as_ref().map(|retired| cordon("retired", retired));
     let cordoned = control.cordon.as_ref().map(|cordoned| cordon("cordoned", cordoned));
-    control.holds.iter().map(hold).chain([retired, cordoned, breaker, drain].into_iter().flatten()).collect()
+    let holds = few(control.holds.iter().map(hold).collect());
+    holds.into_iter().chain([retired, cordoned, breaker, drain].into_iter().flatten()).collect()
 }
 
 /// Whether it is heard, and if not since when; with a star if only its launcher is, which nobody proves.
@@ -214,6 +215,14 @@ mod tests {
             area_id: "hall".into(),
             ..v1::Robot::default()
         }
+    }
+
+    #[test]
+    fn a_robot_that_is_held_by_hundreds_of_stops_has_a_row_that_can_be_read() {
+        let hold = |n| fleet::Hold { token: format!("resume:STOP-{n:040}"), since: ago(90_000) };
+        let control = fleet::RobotControl { holds: (0..256).map(hold).collect(), ..fleet::RobotControl::default() };
+        let state = state(&heard(), Some(&control), Some(NOW));
+        assert!(state.ends_with(", +253 more") && state.len() < 300, "{state}");
     }
 
     #[test]

@@ -98,8 +98,8 @@ fn holding<'a>(controls: impl IntoIterator<Item = &'a RobotControl>, typed: &str
 fn resumed(answer: &v1::ResumeHeldResponse) -> String {
     match (answer.robots, answer.pending) {
         (Some(0), _) => "nothing waited for it".to_owned(),
-        (Some(1), false) => "1 robot resumed".to_owned(),
-        (Some(robots), false) => format!("{robots} robots resumed"),
+        (Some(1), false) => "1 robot resumed, from when it is heard".to_owned(),
+        (Some(robots), false) => format!("{robots} robots resumed, each from when it is heard"),
         (_, true) => "resume asked for; fleet has not looked at it yet".to_owned(),
         (None, false) => "resumed".to_owned(),
     }
@@ -112,6 +112,14 @@ mod tests {
     fn held(tokens: &[&str]) -> RobotControl {
         let hold_tokens = tokens.iter().map(|token| (*token).to_owned()).collect();
         RobotControl { hold_tokens, ..RobotControl::default() }
+    }
+
+    #[test]
+    fn robots_that_waited_are_not_told_as_if_all_of_them_were_heard() {
+        let told = |robots| resumed(&v1::ResumeHeldResponse { robots: Some(robots), ..Default::default() });
+        assert_eq!(told(0), "nothing waited for it");
+        assert_eq!(told(1), "1 robot resumed, from when it is heard");
+        assert_eq!(told(28), "28 robots resumed, each from when it is heard");
     }
 
     #[test]
