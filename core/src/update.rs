@@ -116,8 +116,8 @@ impl UpdateState {
             Self::Switching => &[Self::Probation, Self::Staged, Self::RollingBack, Self::RolledBack, Self::Refused],
             Self::Probation => &[Self::Trial, Self::RollingBack, Self::RolledBack],
             Self::Trial => &[Self::Committing, Self::RollingBack, Self::RolledBack],
-            // Put away by the launcher before the switch record named it as committed.
-            Self::Committing => &[Self::Committed, Self::RolledBack],
+            // Put away by the launcher, or found changed on the disk, before the switch record named it as committed.
+            Self::Committing => &[Self::Committed, Self::RollingBack, Self::RolledBack],
             Self::RollingBack => &[Self::RolledBack, Self::Stuck],
             // A committed set may be reverted as long as the one before it is kept.
             Self::Committed => &[Self::RollingBack],

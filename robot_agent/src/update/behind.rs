@@ -5,7 +5,6 @@
 use super::Update;
 use crate::core::AgentCore;
 use crate::switch::Switch;
-use midshift_core::reason::{Code, Reason};
 use midshift_core::update::UpdateState;
 
 impl AgentCore {
@@ -25,11 +24,5 @@ impl AgentCore {
         }
         self.write_switch(switch);
         true
-    }
-
-    /// The launcher has put a set away that was committed: it followed an older record. It is not told as kept any more.
-    pub(super) fn has_fallen(&mut self, update: Update, tries: u32) {
-        let reason = Reason::from(Code::ProgramCrashed).with("tries", tries);
-        self.go_back(Update { tries, ..update }, reason);
     }
 }

@@ -580,10 +580,11 @@ impl AgentCore {
         if let Some(fallen) = fallen.filter(|_| active) {
             let reason = Reason::from(Code::ProgramCrashed).with("tries", fallen.tries);
             let (state, tries) = (UpdateState::RolledBack, fallen.tries);
+            // What a commit was about to say is not said any more.
+            self.intend(&switch);
             return self.put_update(Update { state, tries, reason: Some(reason), ..update });
         }
         match update.state {
-            UpdateState::Committed if fallen.is_some() => self.has_fallen(update, fallen.map_or(0, |f| f.tries)),
             UpdateState::Switching if runs => self.move_to(UpdateState::Probation, None),
             // The power went before the record was written: the grant was not used.
             UpdateState::Switching => self.move_to(UpdateState::Staged, None),

@@ -150,8 +150,9 @@ impl AgentCore {
     /// Writes down what the switch record is about to say of committed sets.
     pub(super) fn intend(&mut self, switch: &Switch) {
         let (proven, meant) = (self.proven(), Committed::of(switch));
-        if proven.committed != meant {
-            self.put_proven(Proven { intended: Some(meant), ..proven });
+        let intended = Some(meant).filter(|meant| *meant != proven.committed);
+        if proven.intended != intended {
+            self.put_proven(Proven { intended, ..proven });
         }
     }
 
@@ -184,7 +185,7 @@ impl AgentCore {
         match &self.update.standing {
             Standing::Holds => Next::GoesOn,
             Standing::Bad(_) => self.remedy(now, holdings),
-            Standing::Unknown if self.ends_anyway(&holdings.switch) => Next::GoesOn,
+            Standing::Unknown if self.ends_anyway(&holdings.switch) => self.end_beside_an_update(holdings),
             Standing::Unknown => match self.held(holdings) {
                 Ok(Some(set)) => {
                     self.ask_for(Job::Check { set: set.id(), file: PROGRAM.to_owned() });
@@ -207,6 +208,17 @@ impl AgentCore {
         let update = self.kept.ledger.software.update.as_ref();
         let trial = switch.trial.as_ref().map(|trial| &trial.set);
         trial.is_some() && update.and_then(Update::set_name).as_ref() != trial
+    }
+
+    /// An update that has switched nothing yet keeps the machine from it: then it is ended here.
+    fn end_beside_an_update(&mut self, holdings: &Holdings) -> Next {
+        let state = self.kept.ledger.software.update.as_ref().map(|u| u.state);
+        if !matches!(state, Some(UpdateState::Directed | UpdateState::Downloading | UpdateState::Staged)) {
+            return Next::GoesOn;
+        }
+        self.update.leaves = Some(holdings.switch.number);
+        self.end_unknown_trial(&holdings.switch);
+        Next::Waits
     }
 
     /// The set that runs if its program is to be looked at; none: it has none.
@@ -281,7 +293,7 @@ impl AgentCore {
         let update = self.kept.ledger.software.update.clone();
         let state = update.as_ref().map(|u| u.state);
         if let Some(update) = update.filter(|_| holdings.switch.trial.is_some()) {
-            if matches!(update.state, UpdateState::Probation | UpdateState::Trial) {
+            if matches!(update.state, UpdateState::Probation | UpdateState::Trial | UpdateState::Committing) {
                 self.go_back(update, reason);
             }
             return Next::GoesOn;

@@ -16,6 +16,8 @@ use std::time::{Duration, SystemTime};
 
 /// File of the data folder.
 const FILE: &str = "clock-accepted";
+/// File of the data folder while there is a doubt: the time before it, unix ms.
+const DOUBTED: &str = "clock-doubted";
 /// What it is called in the audit.
 const ACTION: &str = "clock.accept";
 /// How often a server looks, real time.
@@ -41,8 +43,10 @@ pub fn leave_word(data: &Path) -> anyhow::Result<()> {
 ///
 /// # Errors
 /// The store.
-pub async fn check_start(clock: &dyn Clock, store: &dyn Store) -> anyhow::Result<()> {
-    if let Some(newest) = newest_time(store).await.context("reading the newest time of the store")? {
+pub async fn check_start(data: &Path, clock: &dyn Clock, store: &dyn Store) -> anyhow::Result<()> {
+    let newest = newest_time(store).await.context("reading the newest time of the store")?;
+    // What was written in doubt has the doubted time.
+    if let Some(newest) = newest.map(|newest| undoubted(data).map_or(newest, |before| before.min(newest))) {
         clock.check_start(newest);
     }
     if let Some(doubt) = clock.doubt() {
@@ -50,6 +54,25 @@ pub async fn check_start(clock: &dyn Clock, store: &dyn Store) -> anyhow::Result
         tracing::error!(ahead_s, newest, "nothing is signed: the wall clock is far past what was written last");
     }
     Ok(())
+}
+
+/// The time before the doubt in which the run before ended; none: it ended without one.
+fn undoubted(data: &Path) -> Option<Utc> {
+    fs::read_to_string(data.join(DOUBTED)).ok()?.trim().parse().ok().map(Utc)
+}
+
+/// Keeps for the next start from when on nothing is believed, as long as there is a doubt.
+fn keep_doubt(data: &Path, clock: &dyn Clock) -> anyhow::Result<()> {
+    let path = data.join(DOUBTED);
+    let keeping = || format!("keeping {}", path.display());
+    match clock.doubt() {
+        Some(doubt) if undoubted(data).is_none() => {
+            let before = doubt.at.0.saturating_sub(doubt.step_ms);
+            midshift_durable::replace(&path, before.to_string().as_bytes()).with_context(keeping)
+        }
+        Some(_) => Ok(()),
+        None => midshift_durable::remove(&path).map(drop).with_context(keeping),
+    }
 }
 
 /// None: nothing is in the log.
@@ -76,6 +99,9 @@ pub async fn run(data: &Path, clock: &dyn Clock, store: &dyn Store) {
     loop {
         if let Err(error) = take_word(data, clock, store, &mut read).await {
             tracing::warn!(error = format!("{error:#}"), "a word about the clock was not taken: say it again");
+        }
+        if let Err(error) = keep_doubt(data, clock) {
+            tracing::warn!(error = format!("{error:#}"), "a doubt about the clock is not kept for the next start");
         }
         tokio::time::sleep(LOOK_EVERY).await;
     }
@@ -154,17 +180,40 @@ mod tests {
 
     #[tokio::test]
     async fn a_start_is_held_against_the_newest_entry_of_the_store() {
+        let dir = tempfile::tempdir().expect("a folder");
         let (wall, clock, store) = site();
-        check_start(&*clock, &store).await.expect("an empty store says nothing");
+        check_start(dir.path(), &*clock, &store).await.expect("an empty store says nothing");
         for _ in 0..2 * ENTRIES {
             write(&store).await;
         }
         for (days, is_doubted) in [(7, false), (8, true)] {
             let begun = Utc(wall.load(Relaxed) + days * DAY_MS);
             let next = WallClock::new(|| 0, move || begun, |_| {});
-            check_start(&next, &store).await.expect("read");
+            check_start(dir.path(), &next, &store).await.expect("read");
             assert_eq!(next.doubt().is_some(), is_doubted, "{days} days");
         }
+    }
+
+    #[tokio::test]
+    async fn a_doubt_outlives_a_restart_though_entries_were_written_meanwhile_and_ends_with_it() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let (wall, clock, store) = site();
+        write(&store).await;
+        wall.fetch_add(30 * DAY_MS, Relaxed);
+        write(&store).await;
+        keep_doubt(dir.path(), &*clock).expect("kept");
+        let begun = Utc(wall.load(Relaxed));
+        let start = async |begun: Utc| {
+            let next = WallClock::new(|| 0, move || begun, |_| {});
+            check_start(dir.path(), &next, &store).await.expect("read");
+            next
+        };
+        assert!(start(begun).await.doubt().is_some());
+        wall.fetch_sub(30 * DAY_MS, Relaxed);
+        let right = start(Utc(wall.load(Relaxed))).await;
+        assert_eq!(right.doubt(), None, "the wall is right again");
+        keep_doubt(dir.path(), &right).expect("looked");
+        assert_eq!(fs::read_dir(dir.path()).expect("a folder").count(), 0);
     }
 
     #[tokio::test]

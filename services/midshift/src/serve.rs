@@ -196,7 +196,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
     crate::recorder::handle();
     let site_id = loaded.site.site_id().clone();
     let storage = args.database.open(&args.data, site_id, clock.clone()).await?;
-    clock_doubt::check_start(&*clock, &*storage.store()).await?;
+    clock_doubt::check_start(&args.data, &*clock, &*storage.store()).await?;
     let (loaded, map) = match roles.has(Role::Fleet) {
         true => changed_map::choose(&*storage.store(), loaded, args.force_map, clock.now()).await?,
         false => (changed_map::follow(&*storage.store(), loaded).await?, Default::default()),

@@ -29,11 +29,16 @@ fn the_incident_of_a_robot_that_is_not_understood_closes_once_it_was_served_for_
     let robot_id = RobotId::parse("r1").expect("an id");
     Arc::make_mut(rig.board.get_mut(&robot_id).expect("a robot")).report.hb = 1;
     refused(&mut rig, &robot_id);
-    for _ in 2..60 {
+    let beat = |rig: &mut Rig| {
         rig.pass(1_000);
+        let now = rig.now.site;
+        Arc::make_mut(rig.board.get_mut(&robot_id).expect("a robot")).processed_site = now;
+    };
+    for _ in 2..60 {
+        beat(&mut rig);
         assert_eq!(open(&mut rig), [Code::RobotNotUnderstood]);
     }
-    rig.pass(1_000);
+    beat(&mut rig);
     assert_eq!(open(&mut rig), []);
 }
 

@@ -11,7 +11,7 @@ use std::fs;
 async fn a_server_takes_a_new_project_once_the_documents_of_the_old_one_were_moved_away() {
     let (room, _) = published().await;
     let seeds = Seeds { root: 61, targets: 62, snapshot: 63, timestamp: 64 };
-    for (name, seed) in [("snapshot-2", seeds.snapshot), ("timestamp-2", seeds.timestamp)] {
+    for (name, seed) in [("snapshot-9", seeds.snapshot), ("timestamp-9", seeds.timestamp)] {
         key(seed).write(&room.dir.path().join("keys").join(format!("{name}.pem"))).expect("written");
     }
     let first = root(1, seeds, START.plus_ms(PEOPLE_LIFE_MS), &[seeds.root]);
