@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 /// Tasks are spawned in a crate's `lib.rs`. Elsewhere only here, each for a reason.
 const SPAWNS: &[(&str, &str)] = &[
     ("services/telemetry/src/link.rs", "one task a session: it must outlive the handler that opened it"),
+    ("services/telemetry/src/misreads.rs", "one fact: the robot's stream may be gone before it is written"),
     ("services/telemetry/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/task/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/identity/src/audit/grpc.rs", "one task an export or verification, ended by its reader or by shutdown"),
@@ -50,6 +51,7 @@ const SYNCED_BY_HAND: &[(&str, &str)] = &[
     ("services/midshift/src/cli/audit.rs", "an export comes a record at a time"),
     ("services/midshift/src/samples.rs", "a second name for a file that is there"),
     ("services/ota/src/content.rs", "an upload comes a piece at a time"),
+    ("services/ota/src/folder.rs", "a number is written where it lies, under the lock on its file"),
     ("services/ota/src/fixture.rs", "a test puts a file aside and back"),
     ("services/stop/src/audit.rs", "a line at a time"),
     (
@@ -139,6 +141,9 @@ const LOGGED: &[(&str, &str, &str)] = &[
     ),
     ("services/stop/src/acts.rs", "level", "one of four words"),
     ("services/stop/src/opening.rs", "why", "a sentence of this program"),
+    ("services/telemetry/src/link.rs", "why", "which field breaks which rule, in the words of the decoder"),
+    ("services/telemetry/src/misreads.rs", "why", "which field breaks which rule, in the words of the decoder"),
+    ("services/telemetry/src/session.rs", "why", "which field breaks which rule, in the words of the decoder"),
     ("services/telemetry/src/welcome.rs", "rejection", "one of a closed list of sentences about signed documents"),
     ("services/midshift/src/logs.rs", "message", "the constant words of a line that was counted"),
 ];

@@ -53,7 +53,7 @@ pub struct Parts {
     pub map: MapChange,
     /// Clocks.
     pub clock: Arc<dyn Clock>,
-    /// What the wall jumped at last before this run, milliseconds ahead, and UTC when it had; see [`crate::clock_jump`].
+    /// What the wall jumped at last before this run, milliseconds ahead, and UTC when it had.
     pub jumped_before: Option<(i64, Utc)>,
     /// Software of robots, of a process with role ota.
     pub ota: OtaService,
