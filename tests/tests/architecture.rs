@@ -117,6 +117,8 @@ const LOGGED: &[(&str, &str, &str)] = &[
     ("robot_agent/src/stop/obey.rs", "awaiting_resume", "ids"),
     ("robot_agent/src/update/believes.rs", "rejection", "one of a closed list of sentences about signed documents"),
     ("robot_agent/src/update/believes.rs", "keys", "digests"),
+    ("robot_agent/src/update/standing.rs", "sets", "digests"),
+    ("robot_agent/src/update/standing.rs", "why", "which file of a set has which digest, in sentences of this program"),
     ("robot_agent/src/update/io.rs", "base", "a digest"),
     ("robot_agent/src/update/pursue.rs", "why", "what the transport or a disk said"),
     ("robot_agent/src/update/pursue.rs", "from", "one of a closed list of states"),
