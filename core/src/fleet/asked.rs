@@ -48,7 +48,7 @@ pub enum Command {
     },
     /// Labels that go before what the robot says itself.
     Label {
-        /// Whose.
+        /// The robot that has them.
         robot_id: RobotId,
         /// Labels that it gets.
         labels: BTreeMap<String, String>,

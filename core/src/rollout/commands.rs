@@ -103,14 +103,14 @@ pub enum Command {
     },
     /// A person mended what kept the robot from going back: it is told to go back once more.
     Unstick {
-        /// Whom.
+        /// The robot that is told.
         robot_id: RobotId,
         /// What was done.
         reason: String,
     },
     /// The machine that shows this device key is the robot's.
     AcceptKey {
-        /// Whose.
+        /// The robot whose key it is.
         robot_id: RobotId,
         /// The key, 64 lower-case hexadecimal digits.
         device_key: String,
