@@ -3,10 +3,10 @@
 use crate::harness::{Server, channel, folder, until};
 use crate::kill::{all_over, at_work, judge, submit};
 use crate::proxy::Proxy;
-use crate::robots::Robots;
+use crate::robots::{Robots, with_robots};
 use crate::split::events_have_no_hole;
 use anyhow::ensure;
-use midshift_core::site::{DEMO, text};
+use midshift_core::site::DEMO;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use midshift_proto::telemetry::v1::{Event, ListEventsRequest, ListRobotsRequest, Presence, RobotFilter, event::Item};
 use std::collections::{BTreeMap, BTreeSet};
@@ -70,10 +70,10 @@ fn at_work_inside(events: &[Event], from_ms: i64, to_ms: i64) -> BTreeSet<String
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn after_a_cut_of_twenty_seconds_every_event_is_there_in_order_and_once() -> anyhow::Result<()> {
     let dir = folder()?;
-    let site = text::parse(DEMO)?;
-    let server = Server::start(dir.path()).await?;
+    let site = with_robots(DEMO, CUT.len())?;
+    let server = Server::start_for(dir.path(), &site).await?;
     let (address, proxy) = (server.address, Proxy::before(server.address).await?);
-    let robots = Robots::start(dir.path(), proxy.address, address, &site, CUT.len()).await?;
+    let robots = Robots::start(dir.path(), proxy.address, address, &site).await?;
     ensure!(robots.ids() == CUT, "{:?}", robots.ids());
     submit(address, &site, 5, TASKS).await?;
     at_work(address, 2, &BTreeSet::new()).await?;

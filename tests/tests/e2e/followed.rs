@@ -2,7 +2,7 @@
 
 use crate::harness::{folder, until};
 use crate::kill::{all_over, at_work, judge, submit};
-use crate::robots::Robots;
+use crate::robots::{Robots, with_robots};
 use crate::rolled_out::done;
 use crate::stack::Stack;
 use crate::stopped::{StopServer, judge_stops, until_held};
@@ -18,8 +18,8 @@ const LIMIT: Duration = Duration::from_secs(60);
 async fn a_stop_beside_a_split_stack_is_followed_by_one_process_and_by_the_next_when_that_is_killed()
 -> anyhow::Result<()> {
     let dir = folder()?;
-    let site = text::parse(DEMO)?;
-    let stack = Stack::start(dir.path(), DEMO, &["--no-software"], &[]).await?;
+    let site = with_robots(DEMO, ROBOTS)?;
+    let stack = Stack::start(dir.path(), &text::render(&site), &["--no-software"], &[]).await?;
     let apart = dir.path().join("apart");
     std::fs::create_dir(&apart)?;
     std::fs::copy(&stack.site, apart.join("site.toml"))?;
@@ -35,8 +35,7 @@ async fn a_stop_beside_a_split_stack_is_followed_by_one_process_and_by_the_next_
     })
     .await?;
     let stops = StopServer::start(&apart, stack.public).await?;
-    let robots =
-        Robots::start_beside(dir.path(), stack.robots, stack.public, Some(stops.address), &site, ROBOTS).await?;
+    let robots = Robots::start_beside(dir.path(), stack.robots, stack.public, Some(stops.address), &site).await?;
     submit(stack.public, &site, 7, TASKS).await?;
     at_work(stack.public, 4, &BTreeSet::new()).await?;
 

@@ -4,7 +4,7 @@ use crate::engine::fresh_store;
 use crate::secrets::{keep_keys, keep_secret, secret_part, told_by_log};
 use anyhow::{Context, bail, ensure};
 use midshift::way::{Line, Way};
-use midshift_core::site::DEMO;
+use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::identity::v1::CreateTokenRequest;
 use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
@@ -298,6 +298,10 @@ impl Server {
     /// Starts it with TLS and login, and waits until it answers; this program is signed in and may do everything.
     pub async fn start(dir: &Path) -> anyhow::Result<Self> {
         Self::start_on(dir, DEMO).await
+    }
+    /// On a site that names its robots.
+    pub async fn start_for(dir: &Path, site: &Site) -> anyhow::Result<Self> {
+        Self::start_on(dir, &text::render(site)).await
     }
     /// On another site than the demo.
     pub async fn start_on(dir: &Path, site: &str) -> anyhow::Result<Self> {

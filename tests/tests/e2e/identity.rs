@@ -2,7 +2,7 @@
 
 use crate::harness::{Running, Server, channel, folder, midshift, sign_in, until};
 use crate::kill::{all_over, at_work, judge, submit};
-use crate::robots::{Robots, enrolment};
+use crate::robots::{Robots, enrolment, with_robots};
 use crate::rolled_out::{call, done};
 use crate::secrets::{heard, keep_secret, secret_part};
 use crate::stack::{Stack, machines_of};
@@ -68,11 +68,11 @@ fn serial(folder: &Path) -> anyhow::Result<String> {
 async fn a_copied_key_is_observed_with_an_incident_while_the_original_works_and_a_revoked_robot_is_cut()
 -> anyhow::Result<()> {
     let dir = folder()?;
-    let site: Site = text::parse(DEMO)?;
-    let server = Server::start(dir.path()).await?;
+    let site: Site = with_robots(DEMO, ROBOTS)?;
+    let server = Server::start_for(dir.path(), &site).await?;
     let address = server.address;
     let stops = StopServer::start(dir.path(), address).await?;
-    let robots = Robots::start_beside(dir.path(), address, address, Some(stops.address), &site, ROBOTS).await?;
+    let robots = Robots::start_beside(dir.path(), address, address, Some(stops.address), &site).await?;
     submit(address, &site, 7, TASKS).await?;
     at_work(address, 4, &BTreeSet::new()).await?;
 
@@ -159,11 +159,11 @@ async fn is_let_in(stops: SocketAddr, folder: &Path) -> anyhow::Result<()> {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_revoked_robot_is_cut_off_from_the_stop_service_too_and_stands_by_itself() -> anyhow::Result<()> {
     let dir = folder()?;
-    let site: Site = text::parse(DEMO)?;
-    let server = Server::start(dir.path()).await?;
+    let site: Site = with_robots(DEMO, 2)?;
+    let server = Server::start_for(dir.path(), &site).await?;
     let stops = StopServer::start(dir.path(), server.address).await?;
     let (address, line) = (server.address, Some(stops.address));
-    let robots = Robots::start_beside(dir.path(), address, address, line, &site, 2).await?;
+    let robots = Robots::start_beside(dir.path(), address, address, line, &site).await?;
     let journals = robots.journals();
     let newest = |nth: usize| Ok::<_, anyhow::Error>(obeyed(&journals[nth])?.last().copied());
     until("both are let go", LIMIT, async || {

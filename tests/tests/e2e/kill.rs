@@ -2,7 +2,7 @@
 //! stop of PostgreSQL where the server keeps its rows there.
 
 use crate::harness::{Server, in_states, tasks, until};
-use crate::robots::Robots;
+use crate::robots::{Robots, with_robots};
 use midshift::background::request;
 use midshift_agent::ledger::Holder;
 use midshift_core::site::{DEMO, Site, text};
@@ -76,11 +76,11 @@ async fn killed_at_work(mut postgres: Option<PostgresServer>) -> anyhow::Result<
     let seed: u64 = std::env::var("MIDSHIFT_SEED").ok().and_then(|s| s.parse().ok()).unwrap_or(20_261_120);
     let mut rng = StdRng::seed_from_u64(seed);
     let dir = tempfile::tempdir()?;
-    let site = text::parse(DEMO)?;
+    let site = with_robots(DEMO, ROBOTS)?;
     let url = postgres.as_ref().map(PostgresServer::database);
     let flags: Vec<&str> = url.iter().flat_map(|url| ["--store", url.as_str()]).collect();
-    let mut server = Server::start_with(dir.path(), DEMO, &flags).await?;
-    let mut robots = Robots::start(dir.path(), server.address, server.address, &site, ROBOTS).await?;
+    let mut server = Server::start_with(dir.path(), &text::render(&site), &flags).await?;
+    let mut robots = Robots::start(dir.path(), server.address, server.address, &site).await?;
     submit(server.address, &site, seed, TASKS).await?;
     let mut kills: Vec<(usize, bool)> =
         [(8, true), (16, false), (24, false), (32, true), (40, false), (48, false), (56, true), (62, false)]

@@ -1,11 +1,11 @@
 //! Robots and stops by the beginning of their ids, as a person types them.
 
 use crate::harness::{Server, folder};
-use crate::robots::Robots;
+use crate::robots::{Robots, with_robots};
 use crate::rolled_out::call;
 use crate::stopped::{StopServer, until_held};
 use anyhow::ensure;
-use midshift_core::site::{DEMO, Site, text};
+use midshift_core::site::{DEMO, Site};
 
 /// What a command prints with `-o name`.
 fn named(arguments: &[&str]) -> anyhow::Result<String> {
@@ -24,12 +24,12 @@ fn refused(arguments: &[&str]) -> anyhow::Result<(Option<i32>, String)> {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_robot_and_a_stop_are_meant_by_a_beginning_that_only_they_have() -> anyhow::Result<()> {
     let dir = folder()?;
-    let site: Site = text::parse(DEMO)?;
-    let server = Server::start(dir.path()).await?;
+    let site: Site = with_robots(DEMO, 1)?;
+    let server = Server::start_for(dir.path(), &site).await?;
     let stops = StopServer::start(dir.path(), server.address).await?;
     let (at, stop_at) = (server.address.to_string(), stops.address.to_string());
     let beside = Some(stops.address);
-    let robot = Robots::start_beside(dir.path(), server.address, server.address, beside, &site, 1).await?;
+    let robot = Robots::start_beside(dir.path(), server.address, server.address, beside, &site).await?;
     for (verb, typed) in [("get", "rbt-01"), ("get", "r"), ("explain", "rbt"), ("uncordon", "rbt-0")] {
         ensure!(named(&["robot", verb, typed, "--server", &at])? == "rbt-01", "{verb} {typed}");
     }

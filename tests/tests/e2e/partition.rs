@@ -6,7 +6,7 @@
 
 use crate::harness::{channel, folder, in_states, until};
 use crate::kill::{TASKS, all_over, at_work, judge, judge_ledgers, submit};
-use crate::robots::Robots;
+use crate::robots::{Robots, with_robots};
 use crate::split::{ROBOTS, events_have_no_hole};
 use crate::stack::{Stack, is_ready};
 use anyhow::{Context, ensure};
@@ -122,10 +122,10 @@ async fn no_authority_came_through(
 
 async fn cut_off(sever: fn(&Line), seed: u64) -> anyhow::Result<()> {
     let dir = folder()?;
-    let site = text::parse(DEMO)?;
-    let mut stack = Stack::start(dir.path(), DEMO, &["--no-software"], &[]).await?;
+    let site = with_robots(DEMO, ROBOTS)?;
+    let mut stack = Stack::start(dir.path(), &text::render(&site), &["--no-software"], &[]).await?;
     let (gateway, other) = (stack.address("telemetry", 0)?, stack.address("telemetry", 1)?);
-    let robots = Robots::start(dir.path(), stack.robots, stack.public, &site, ROBOTS).await?;
+    let robots = Robots::start(dir.path(), stack.robots, stack.public, &site).await?;
     submit(stack.public, &site, seed, TASKS).await?;
     let mut here = BTreeSet::new();
     for done in (4..).step_by(2) {

@@ -2,7 +2,7 @@
 
 use crate::clients::{grpcurl, text};
 use crate::harness::{channel, folder, midshift, sign_in, tool, until};
-use crate::robots::Robots;
+use crate::robots::{Robots, with_robots};
 use crate::secrets::heard;
 use crate::stack::Stack;
 use midshift_core::site::{DEMO, text as site_text};
@@ -21,9 +21,9 @@ print(urllib.request.urlopen(asked, context=ssl.create_default_context(cafile=sy
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn people_programs_and_robots_come_through_the_shipped_proxy() -> anyhow::Result<()> {
     let dir = folder()?;
-    let site = site_text::parse(DEMO)?;
-    let stack = Stack::start(dir.path(), DEMO, &["--no-software"], &[]).await?;
-    let _robots = Robots::start(dir.path(), stack.robots, stack.public, &site, 4).await?;
+    let site = with_robots(DEMO, 4)?;
+    let stack = Stack::start(dir.path(), &site_text::render(&site), &["--no-software"], &[]).await?;
+    let _robots = Robots::start(dir.path(), stack.robots, stack.public, &site).await?;
     let address = stack.public;
     let public = address.to_string();
     // Every service is shown, and each path reaches its own.

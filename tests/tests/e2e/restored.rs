@@ -1,7 +1,7 @@
 //! A backup is taken while robots work, the server is lost, and the robots carry on from what was restored.
 
 use crate::harness::{Server, command, until};
-use crate::robots::Robots;
+use crate::robots::{Robots, with_robots};
 use crate::secrets::heard;
 use crate::stopped::{StopServer, resume, until_held};
 use midshift::background::request;
@@ -132,12 +132,12 @@ async fn robots_carry_on_from_a_backup_of_postgresql_that_was_taken_while_they_w
 
 async fn drill(engine: Engine) -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
-    let site = text::parse(DEMO)?;
+    let site = with_robots(DEMO, ROBOTS)?;
     engine.prepare();
     let flags = engine.flags();
     let flags: Vec<&str> = flags.iter().map(String::as_str).collect();
-    let mut server = Server::start_with(dir.path(), DEMO, &flags).await?;
-    let robots = Robots::start(dir.path(), server.address, server.address, &site, ROBOTS).await?;
+    let mut server = Server::start_with(dir.path(), &text::render(&site), &flags).await?;
+    let robots = Robots::start(dir.path(), server.address, server.address, &site).await?;
     let before = submit(&server, &site, 1, "before").await?;
     until_done(&server, 2).await?;
     let (data, backup) = (server.data(), dir.path().join("backup"));
@@ -174,11 +174,10 @@ async fn drill(engine: Engine) -> anyhow::Result<()> {
 async fn a_restored_stop_service_stops_what_stood_at_the_backup_and_takes_later_stops_back_from_robots()
 -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
-    let site = text::parse(DEMO)?;
-    let mut server = Server::start(dir.path()).await?;
+    let site = with_robots(DEMO, 4)?;
+    let mut server = Server::start_for(dir.path(), &site).await?;
     let mut stops = StopServer::start(dir.path(), server.address).await?;
-    let robots =
-        Robots::start_beside(dir.path(), server.address, server.address, Some(stops.address), &site, 4).await?;
+    let robots = Robots::start_beside(dir.path(), server.address, server.address, Some(stops.address), &site).await?;
     let [stood, reset_later] = [stops.stop(&["--robot", "rbt-01"])?, stops.stop(&["--robot", "rbt-02"])?];
     let reset_before = stops.stop(&["--robot", "rbt-04"])?;
     stops.reset(&reset_before)?;

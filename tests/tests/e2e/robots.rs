@@ -12,7 +12,7 @@ use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::store::Store;
 use midshift_agent::tls::Tls;
 use midshift_core::ids::RobotId;
-use midshift_core::site::Site;
+use midshift_core::site::{Site, text};
 use midshift_proto::fleet::v1::ListPlacesRequest;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::identity::v1::CreateEnrolmentRequest;
@@ -41,16 +41,9 @@ pub struct Robots {
 }
 
 impl Robots {
-    /// Starts `count` of them at starting places of the site, and waits until the server at `public` knows where each stands: a robot that nobody
-    /// has heard of yet may stand in a place that is given to others meanwhile.
-    pub async fn start(
-        dir: &Path,
-        server: SocketAddr,
-        public: SocketAddr,
-        site: &Site,
-        count: usize,
-    ) -> anyhow::Result<Self> {
-        Self::start_beside(dir, server, public, None, site, count).await
+    /// Starts those that the site names, and waits until the server at `public` knows where each stands.
+    pub async fn start(dir: &Path, server: SocketAddr, public: SocketAddr, site: &Site) -> anyhow::Result<Self> {
+        Self::start_beside(dir, server, public, None, site).await
     }
     /// As [`Robots::start`], with lines to the stop service at `stops`.
     pub async fn start_beside(
@@ -59,10 +52,9 @@ impl Robots {
         public: SocketAddr,
         stops: Option<SocketAddr>,
         site: &Site,
-        count: usize,
     ) -> anyhow::Result<Self> {
-        let starts: Vec<String> =
-            site.starting_places(count).into_iter().map(|at| site.name_of(at).to_string()).collect();
+        let starts: Vec<String> = site.starts().values().map(|at| site.name_of(*at).to_string()).collect();
+        anyhow::ensure!(!starts.is_empty(), "the site names no robots: `with_robots` gives it some");
         Self::start_at(dir, server, public, stops, &starts).await
     }
     /// As [`Robots::start_beside`], one at each of these waypoints.
@@ -229,6 +221,15 @@ pub async fn keep_secrets(folder: &Path) -> anyhow::Result<()> {
     keep_secret("a session's secret", known.session.secret.reveal());
     let key = serde_json::to_value(known.device.context("a key")?)?;
     keep_key("a machine's key", key.as_str().context("a key in PEM")?)
+}
+
+/// A site in which `count` robots start: nobody is sent to where one of them stands before it has been heard.
+pub fn with_robots(text: &str, count: usize) -> anyhow::Result<Site> {
+    let site = text::parse(text)?;
+    let seats = site.starting_places(count).into_iter().enumerate();
+    let starts = seats.map(|(nth, at)| Ok((RobotId::parse(&robot_id(nth))?, site.name_of(at).clone())));
+    let starts = starts.collect::<anyhow::Result<Vec<_>>>()?;
+    Ok(site.with_starts(&starts)?)
 }
 
 fn robot_id(number: usize) -> String {

@@ -3,7 +3,7 @@
 use crate::factory::with_software;
 use crate::harness::{channel, folder, in_states, until};
 use crate::kill::{TASKS, all_over, at_work, judge, judge_journals, judge_ledgers, submit};
-use crate::robots::Robots;
+use crate::robots::{Robots, with_robots};
 use crate::rolled_out::{begin_rollout, call, done};
 use crate::rolling::{self, Rolling};
 use crate::room::LIMIT;
@@ -87,13 +87,14 @@ async fn tasks_go_on_while_every_process_of_a_split_stack_is_killed_or_replaced_
     let dir = folder()?;
     let many = std::env::var(MANY).ok().map(|many| many.parse::<usize>()).transpose().context(MANY)?;
     let map = many.map_or_else(|| DEMO.to_owned(), free_floor);
-    let site = if many.is_some() { grid::parse_map("site", &map) } else { text::parse(&map) }?;
+    let site = if many.is_some() { grid::parse_map("site", &map)? } else { with_robots(&map, ROBOTS)? };
     let (count, tasks) = many.map_or((ROBOTS, TASKS), |many| (many, many * TASKS_EACH));
     let samples = dir.path().join("samples");
     let (mut stack, robots) = match many {
         None => {
+            let map = text::render(&site);
             let stack = Stack::start(dir.path(), &map, &["--drain-seconds", "20", "--no-software"], &[]).await?;
-            let robots = Robots::start(dir.path(), stack.robots, stack.public, &site, count).await?;
+            let robots = Robots::start(dir.path(), stack.robots, stack.public, &site).await?;
             (stack, robots)
         }
         Some(_) => {
@@ -208,9 +209,9 @@ pub async fn events_have_no_hole(public: SocketAddr, count: usize) -> anyhow::Re
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_fleet_that_was_frozen_while_another_took_over_assigns_nothing_twice() -> anyhow::Result<()> {
     let dir = folder()?;
-    let site = text::parse(DEMO)?;
-    let mut stack = Stack::start(dir.path(), DEMO, &["--no-software"], &[]).await?;
-    let robots = Robots::start(dir.path(), stack.robots, stack.public, &site, ROBOTS).await?;
+    let site = with_robots(DEMO, ROBOTS)?;
+    let mut stack = Stack::start(dir.path(), &text::render(&site), &["--no-software"], &[]).await?;
+    let robots = Robots::start(dir.path(), stack.robots, stack.public, &site).await?;
     submit(stack.public, &site, 11, TASKS).await?;
     for (nth, done) in [(0, 8), (1, 24), (0, 40)] {
         at_work(stack.public, done, &BTreeSet::new()).await?;

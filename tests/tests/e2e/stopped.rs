@@ -3,7 +3,7 @@
 
 use crate::harness::{Running, Server, channel, folder, free_port, has_login, in_states, midshift, same_site, until};
 use crate::kill::{all_over, at_work, judge, submit};
-use crate::robots::Robots;
+use crate::robots::{Robots, with_robots};
 use crate::rolled_out::{call, done};
 use crate::secrets::keep_from_logs;
 use anyhow::{Context, ensure};
@@ -148,11 +148,11 @@ pub fn resume(server: &Server, stop_id: &str) -> anyhow::Result<()> {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_stopped_fleet_stands_through_every_kill_until_it_is_reset_and_resumed() -> anyhow::Result<()> {
     let dir = folder()?;
-    let site: Site = text::parse(DEMO)?;
-    let mut server = Server::start(dir.path()).await?;
+    let site: Site = with_robots(DEMO, ROBOTS)?;
+    let mut server = Server::start_for(dir.path(), &site).await?;
     let mut stops = StopServer::start(dir.path(), server.address).await?;
     let (address, stop_address) = (server.address, Some(stops.address));
-    let robots = Robots::start_beside(dir.path(), address, address, stop_address, &site, ROBOTS).await?;
+    let robots = Robots::start_beside(dir.path(), address, address, stop_address, &site).await?;
     submit(address, &site, 7, TASKS).await?;
     at_work(address, 8, &BTreeSet::new()).await?;
 
@@ -202,13 +202,13 @@ async fn until_kept_from_work(server: SocketAddr, task_id: &str) -> anyhow::Resu
 async fn a_stop_that_is_engaged_while_the_database_is_gone_is_recorded_and_holds_when_it_is_back() -> anyhow::Result<()>
 {
     let dir = folder()?;
-    let site: Site = text::parse(DEMO)?;
+    let site: Site = with_robots(DEMO, ROBOTS)?;
     let mut postgres = PostgresServer::start();
     let url = postgres.database();
-    let server = Server::start_with(dir.path(), DEMO, &["--store", &url]).await?;
+    let server = Server::start_with(dir.path(), &text::render(&site), &["--store", &url]).await?;
     let stops = StopServer::start(dir.path(), server.address).await?;
     let address = server.address;
-    let robots = Robots::start_beside(dir.path(), address, address, Some(stops.address), &site, ROBOTS).await?;
+    let robots = Robots::start_beside(dir.path(), address, address, Some(stops.address), &site).await?;
     submit(address, &site, 7, TASKS).await?;
     at_work(address, 4, &BTreeSet::new()).await?;
 

@@ -2,7 +2,7 @@
 
 use crate::harness::{channel, folder, until};
 use crate::kill::{all_over, judge};
-use crate::robots::Robots;
+use crate::robots::{Robots, with_robots};
 use crate::rolled_out::{call, done};
 use crate::room::LIMIT;
 use crate::split::events_have_no_hole;
@@ -423,14 +423,14 @@ async fn watches_go_forward(otas: Both) -> anyhow::Result<()> {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn two_processes_of_each_service_are_one_to_clients_at_both() -> anyhow::Result<()> {
     let dir = folder()?;
-    let site = text::parse(DEMO)?;
+    let site = with_robots(DEMO, ROBOTS)?;
     let samples = dir.path().join("samples");
     done(&["bundle", "samples", &samples.display().to_string(), "--config-only"])?;
     let keys = samples.join("keys").display().to_string();
-    let mut stack = Stack::start(dir.path(), DEMO, &[], &["--ota-keys", &keys]).await?;
+    let mut stack = Stack::start(dir.path(), &text::render(&site), &[], &["--ota-keys", &keys]).await?;
     let (public, repository) = (stack.public.to_string(), samples.join("repository").display().to_string());
     done(&["bundle", "push", "--server", &public, &repository])?;
-    let robots = Robots::start(dir.path(), stack.robots, stack.public, &site, ROBOTS).await?;
+    let robots = Robots::start(dir.path(), stack.robots, stack.public, &site).await?;
     let [intakes, fleets] = [both(&mut stack, "task")?, both(&mut stack, "fleet")?];
     let [gateways, otas] = [both(&mut stack, "telemetry")?, both(&mut stack, "ota")?];
     let mut watches = at_once(intakes, async |at| {

@@ -4,12 +4,12 @@
 use crate::harness::{Server, channel, folder, until};
 use crate::kill::{all_over, at_work, judge, submit};
 use crate::proxy::Proxy;
-use crate::robots::Robots;
+use crate::robots::{Robots, with_robots};
 use crate::rolled_out::{call, done};
 use crate::stopped::StopServer;
 use anyhow::{Context, ensure};
 use midshift_core::robot::StopLevel;
-use midshift_core::site::{DEMO, text};
+use midshift_core::site::DEMO;
 use midshift_proto::common::v1::StopLevel as Shown;
 use midshift_proto::stop::v1::GetStatusRequest;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
@@ -38,11 +38,11 @@ fn was_let_alone(levels: &[StopLevel]) -> bool {
 async fn a_server_that_is_killed_again_and_again_silences_no_robot_and_the_end_of_the_stop_service_does()
 -> anyhow::Result<()> {
     let dir = folder()?;
-    let site = text::parse(DEMO)?;
-    let mut server = Server::start(dir.path()).await?;
+    let site = with_robots(DEMO, ROBOTS)?;
+    let mut server = Server::start_for(dir.path(), &site).await?;
     let mut stops = StopServer::start(dir.path(), server.address).await?;
     let (address, line) = (server.address, Some(stops.address));
-    let robots = Robots::start_beside(dir.path(), address, address, line, &site, ROBOTS).await?;
+    let robots = Robots::start_beside(dir.path(), address, address, line, &site).await?;
     submit(address, &site, 31, TASKS).await?;
     for done in [2, 10, 18, 26] {
         at_work(address, done, &BTreeSet::new()).await?;

@@ -1,11 +1,11 @@
 //! Whoever watches from a terminal goes on watching when the server is killed and starts again: nothing is missed, and no change is said twice.
 
 use crate::harness::{Running, Server, command, folder, until};
-use crate::robots::Robots;
+use crate::robots::{Robots, with_robots};
 use crate::rolled_out::done;
 use crate::room::LIMIT;
 use anyhow::ensure;
-use midshift_core::site::{DEMO, text};
+use midshift_core::site::DEMO;
 use std::path::Path;
 
 /// What a command line says when its stream was cut.
@@ -33,9 +33,10 @@ async fn says(log: &Path, word: &str, behind: bool) -> anyhow::Result<()> {
 async fn watches_of_the_command_line_go_on_after_the_server_was_killed_without_a_change_said_twice()
 -> anyhow::Result<()> {
     let dir = folder()?;
-    let mut server = Server::start(dir.path()).await?;
+    let site = with_robots(DEMO, 1)?;
+    let mut server = Server::start_for(dir.path(), &site).await?;
     let address = server.address.to_string();
-    let _robots = Robots::start(dir.path(), server.address, server.address, &text::parse(DEMO)?, 1).await?;
+    let _robots = Robots::start(dir.path(), server.address, server.address, &site).await?;
     done(&["robot", "cordon", "rbt-01", "--reason", "waits", "--server", &address])?;
     done(&["task", "submit", "--server", &address, "--task-id", "T1", "--from", "A01", "--to", "B03"])?;
     let (tasks, robots) = (dir.path().join("tasks.log"), dir.path().join("robots.log"));
