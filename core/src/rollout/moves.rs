@@ -5,6 +5,7 @@
 
 use super::hear::{fail, is_hard, is_old, quarantine};
 use super::infrastructure::is_open_to;
+use super::matching::other_key;
 use super::robots::{Move, anchor, area_ahead, is_asked, wants};
 use super::rows::{Act, Given, Lost, RobotSoftware, Rollout, RolloutRobot, Step, WayBack};
 use super::stamp::Stamp;
@@ -154,6 +155,11 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             tx.put(RolloutRobot { lost: None, ..r }, "robot.heard_again");
         }
     }
+}
+
+/// Why nothing is signed for `r` now: nobody can, or its machine is not known to be the robot's. None: it is.
+pub fn unsigned(view: &View, r: &RolloutRobot) -> Option<Reason> {
+    view.keyless.map(Reason::from).or_else(|| other_key(view, &r.robot_id))
 }
 
 /// Whether what is due for `r` is told with a directive that must be signed for that, or takes it out of work only for one.
