@@ -176,6 +176,25 @@ fn a_mended_robot_that_shows_another_key_is_not_ordered_back_until_a_person_take
 }
 
 #[test]
+fn a_roll_out_that_takes_another_back_waits_for_nobody_whose_key_a_person_must_take() {
+    let n = 2;
+    let mut rig = left_another(n);
+    rig.robots[n].fate = Fate::Stubborn;
+    take_back(&mut rig);
+    rig.until(60, |r| r.of("back", n).way_back.generation > 0);
+    let first = section(&rig, n).directive;
+    let device_key = rig.shows_another_key(n);
+    rig.until(200, |r| r.rollout("back").phase == Phase::Completed);
+    let r = rig.of("back", n);
+    assert_eq!((r.step, r.way_back.refused.is_some()), (Step::Reverting, true), "it is not ordered back anew");
+    assert_eq!(section(&rig, n).directive, first);
+    rig.robots[n].fate = Fate::Good;
+    accept(&mut rig, n, device_key);
+    rig.until(60, |r| r.of("back", n).step == Step::RolledBack);
+    assert_ne!(section(&rig, n).directive, first);
+}
+
+#[test]
 fn what_a_stuck_robot_said_before_it_was_mended_does_not_make_it_stuck_again() {
     let mut rig = half();
     let n = rig.order()[0];
