@@ -158,6 +158,9 @@ pub const COMMIT_SLICE_BYTES: usize = GROUP_COMMIT_BYTES / 4;
 pub const COUNTED_MAX: u64 = 1 << 52;
 /// Largest generation of a robot that the server goes on from: half of what is believed, so that what it gives afterwards can be reported too.
 pub const GENERATION_FOLLOWED_MAX: u64 = COUNTED_MAX / 2;
+/// Milliseconds ahead of the clock up to which numbers of permissions follow what a robot says it has used: a hundred years, further than a clock is
+/// set wrong, and far below [`COUNTED_MAX`].
+pub const GRANT_AHEAD_MAX_MS: u64 = 100 * 365 * 24 * 3_600_000;
 /// Points of one route: with the steps of a task it fits an item and a message. A longer task is split by whoever asks for it.
 pub const ROUTE_POINTS_MAX: usize = 2_048;
 /// Robots or tasks let go by one item of a resume: each costs up to 8 rows.

@@ -72,7 +72,7 @@ fn must_be_next(role: &str, version: u64, next: u64) -> Result<(), Refusal> {
 
 /// Copies a file that is not there yet.
 fn copy(from: &Path, to: &Path) -> Result<(), Error> {
-    if to.exists() {
+    if to.try_exists().map_err(io("looking for", to))? {
         return Ok(());
     }
     let beside = to.with_extension("new");
@@ -118,7 +118,7 @@ impl Folder {
     /// If one of the two folders is there already: keys are never written over.
     pub fn create(path: &Path, keys: &Path, profile: Profile, now: Utc) -> Result<Self, Error> {
         for folder in [path, keys] {
-            if folder.exists() {
+            if folder.try_exists().map_err(io("looking for", folder))? {
                 return Err(io("making", folder)(build::taken()));
             }
         }
@@ -340,7 +340,8 @@ impl Folder {
 
     /// No document waits, and each of `keys` is asked for.
     fn must_not_wait(&self, keys: &[&SecretKey]) -> Result<(), Error> {
-        if self.metadata().join(PENDING).exists() {
+        let pending = self.metadata().join(PENDING);
+        if pending.try_exists().map_err(io("looking for", &pending))? {
             let text = "a document waits for signatures: sign that first, or remove metadata/pending.targets.json";
             return Err(Refusal::field("repository", text).into());
         }
@@ -378,9 +379,7 @@ impl Folder {
         let version = version_of(document)?;
         self.write(&format!("{version}.targets.json"), document)?;
         let pending = self.metadata().join(PENDING);
-        if pending.exists() {
-            fs::remove_file(&pending).map_err(io("removing", &pending))?;
-        }
+        midshift_durable::remove(&pending).map_err(io("removing", &pending))?;
         Ok(Signed::Published(version))
     }
 

@@ -325,7 +325,7 @@ fn completed(rollout_id: &RolloutId, bundle: &BundleId, act: Act) -> Rollout {
         resumed: None,
         since: act.at,
         outcome: None,
-        refusals_passed: 0,
+        refusals_seen: Default::default(),
     }
 }
 

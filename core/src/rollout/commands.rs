@@ -520,7 +520,7 @@ fn draft(tx: &Tx, rollout_id: &RolloutId, spec: Arc<RolloutSpec>, actor: &Actor)
         resumed: None,
         since: tx.now.utc,
         outcome: None,
-        refusals_passed: 0,
+        refusals_seen: BTreeSet::new(),
     }
 }
 
@@ -540,7 +540,9 @@ fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &Act
                 "rollout.paused"
             } else {
                 pauses.retain(|pause| !matches!(pause, Pause::Operator | Pause::Content));
-                rollout.refusals_passed = refusals::of_content(tx.view, &rollout).count() as u32;
+                let refused: Vec<RobotId> =
+                    refusals::of_content(tx.view, &rollout).map(|r| r.robot_id.clone()).collect();
+                rollout.refusals_seen.extend(refused);
                 "rollout.resumed"
             };
             phases::set_pauses(tx, rollout, pauses, kind);

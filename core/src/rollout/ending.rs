@@ -12,6 +12,9 @@ use super::view::View;
 use crate::ids::RolloutId;
 use crate::reason::{Code, Reason};
 
+const OFFERED_TO_NOBODY: &str =
+    "A roll-out ended, and people had kept all of its robots from it: excluded, pinned or retired them.";
+
 /// Robots of a roll-out as its ending counts them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Share {
@@ -51,10 +54,11 @@ fn is_reached(rollout: &Rollout, r: &RolloutRobot) -> bool {
     }
 }
 
-/// How a roll-out ends, or would as things are.
+/// How a roll-out ends, or would as things are. One that was offered to nobody has brought nothing.
 pub fn of(view: &View, rollout: &Rollout) -> Ending {
     let Share { offered, reached } = share(view, rollout);
-    let enough = u64::from(reached) * 100 >= u64::from(offered) * u64::from(rollout.spec.complete_percent);
+    let enough =
+        offered > 0 && u64::from(reached) * 100 >= u64::from(offered) * u64::from(rollout.spec.complete_percent);
     if enough { Ending::Complete } else { Ending::Incomplete }
 }
 
@@ -65,8 +69,9 @@ pub fn decide(tx: &mut Tx, rollout: &Rollout) -> Ending {
         Ending::Complete => serve(tx, rollout),
         Ending::Incomplete => {
             let Share { offered, reached } = share(tx.view, rollout);
-            let told = Reason::from(Code::RolloutIncomplete).with("rollout_id", &rollout.rollout_id);
-            let told = told.with("offered", offered).with("reached", reached);
+            let code = Code::RolloutIncomplete;
+            let told = if offered == 0 { Reason::new(code, OFFERED_TO_NOBODY) } else { code.into() };
+            let told = told.with("rollout_id", &rollout.rollout_id).with("offered", offered).with("reached", reached);
             super::incident(tx, None, &told.with("complete_percent", rollout.spec.complete_percent));
         }
     }

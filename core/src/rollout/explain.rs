@@ -84,11 +84,11 @@ fn named(view: &View, board: &Board, now: &Now, rollout: &Rollout, by: Reason) -
 fn waits_for(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
     let mut since = r.since;
     let mut deadline = None;
-    if let Some(code) = view.keyless
+    if let Some(by) = moves::unsigned(view, r)
         && let Some(due) = robots::next(view, board, now, rollout, r)
         && moves::is_signed(view, rollout, r, &due)
     {
-        return Some(Blocked { by: code.into(), since, deadline });
+        return Some(Blocked { by, since, deadline });
     }
     let by = match r.step {
         Step::Committed | Step::RolledBack | Step::Skipped => return None,

@@ -272,7 +272,9 @@ fn plan_all(
         let Some(row) = view.robots.get(&id).map(|r| &r.row) else { continue };
         let Some(rollout) = view.rollout(&row.rollout_id) else { continue };
         let due = robots::next(view, board, &now, rollout, row);
-        if let Some(due) = due.filter(|due| !(view.keyless.is_some() && moves::is_signed(view, rollout, row, due))) {
+        let is_withheld =
+            |due: &robots::Move| moves::is_signed(view, rollout, row, due) && moves::unsigned(view, row).is_some();
+        if let Some(due) = due.filter(|due| !is_withheld(due)) {
             if moves == MOVES_PER_CYCLE {
                 return true;
             }

@@ -5,6 +5,7 @@
 
 use super::hear::{fail, is_hard, is_old, quarantine};
 use super::infrastructure::is_open_to;
+use super::matching::other_key;
 use super::robots::{Move, anchor, area_ahead, is_asked, wants};
 use super::rows::{Act, Given, Lost, RobotSoftware, Rollout, RolloutRobot, Step, WayBack};
 use super::stamp::Stamp;
@@ -156,6 +157,11 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
     }
 }
 
+/// Why nothing is signed for `r` now: nobody can, or its machine is not known to be the robot's. None: it is.
+pub fn unsigned(view: &View, r: &RolloutRobot) -> Option<Reason> {
+    view.keyless.map(Reason::from).or_else(|| other_key(view, &r.robot_id))
+}
+
 /// Whether what is due for `r` is told with a directive that must be signed for that, or takes it out of work only for one.
 pub fn is_signed(view: &View, rollout: &Rollout, r: &RolloutRobot, due: &Move) -> bool {
     match due {
@@ -293,16 +299,26 @@ fn drop_bundle(tx: &mut Tx, r: &RolloutRobot) {
     }
 }
 
-/// Rising, and never used again also after the store was restored.
-fn number(tx: &mut Tx) -> u64 {
+/// Rising, and never used again also after the store was restored; above `used`, which somebody says was given before.
+fn number(tx: &mut Tx, used: u64) -> u64 {
     let clock = tx.view.clocks.get("ota").map(|c| c.row).unwrap_or_default();
-    let number = (clock.number + 1).max(tx.now.wall.0.max(0) as u64);
+    let number = (clock.number.max(used) + 1).max(tx.now.wall.0.max(0) as u64);
     tx.put(super::rows::OtaClock { number, ..clock }, "ota.numbered");
     number
 }
 
+/// The highest permission that a robot says it has used. After a jump of the clock it may lie ahead of everything that a store of before knows; what
+/// lies further ahead than a clock jumps is not followed, so that no robot moves the numbers of all.
+fn used_grant(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> u64 {
+    let said = board.get(robot_id).and_then(|live| live.report.update.as_ref());
+    let known = view.software.get(robot_id.as_str()).and_then(|s| s.row.report.as_ref());
+    let used = said.into_iter().chain(known).map(|report| report.grant_id).max().unwrap_or_default();
+    let most = (now.wall.0.max(0) as u64).saturating_add(limits::GRANT_AHEAD_MAX_MS);
+    if used > most { 0 } else { used }
+}
+
 fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool) {
-    let Ok(drain_id) = DrainId::parse(&format!("ota:{}", number(tx))) else { return };
+    let Ok(drain_id) = DrainId::parse(&format!("ota:{}", number(tx, 0))) else { return };
     let returns = rollout.phase.goes_back();
     let goal = if returns || rollout.revert_of.is_some() { "goes back from" } else { "changes to" };
     let label = tx.view.bundles.get(rollout.spec.bundle.as_str()).map(|b| b.row.label()).unwrap_or_default();
@@ -402,7 +418,8 @@ fn grant(tx: &mut Tx, board: &Board, rollout: &Rollout, mut r: RolloutRobot) {
     if let Some(area) = area_ahead(tx.view, board, rollout, &r) {
         tx.rely::<AreaPolicy>(area.as_str());
     }
-    let grant_id = number(tx);
+    let used = used_grant(tx.view, board, &tx.now, &r.robot_id);
+    let grant_id = number(tx, used);
     let given = ActivationGrant { grant_id, drain_id, authority };
     desire(tx, &r.robot_id, |d| d.grant = Some(given));
     r.grant = Some(Given { grant_id, authority, generation: rollout.generation });

@@ -148,6 +148,11 @@ fn is_offline(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
     !view.is_heard(board, now, &r.robot_id)
 }
 
+/// It is not heard, or shows another key than its own: it goes back once it comes, or once a person has taken that key.
+fn is_out_of_reach(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
+    is_offline(view, board, now, r) || matching::other_key(view, &r.robot_id).is_some()
+}
+
 /// Begins with the first wave once each of its robots has the bundle, or will not have it soon.
 fn prefetching(tx: &mut Tx, board: &Board, mut rollout: Rollout) {
     let waits_for = |id: &RolloutId| tx.view.rollout(id).is_some_and(|r| !r.phase.is_over());
@@ -204,7 +209,7 @@ fn applying(tx: &mut Tx, board: &Board, rollout: Rollout) {
     let open = |r: &RolloutRobot| match r.step {
         Step::Waiting | Step::Staging | Step::Staged | Step::Draining => true,
         Step::Activating => !is_given_up(&tx.now, &rollout, r),
-        Step::Reverting => rollout.revert_of.is_some() && !is_offline(tx.view, board, &tx.now, r),
+        Step::Reverting => rollout.revert_of.is_some() && !is_out_of_reach(tx.view, board, &tx.now, r),
         _ => false,
     };
     if verdict::wave(tx.view, &rollout.rollout_id, wave).any(open) {
@@ -350,7 +355,7 @@ fn rolling_back(tx: &mut Tx, board: &Board, rollout: Rollout) {
         Step::RolledBack | Step::Skipped | Step::Stuck => false,
         Step::Committed | Step::Committing => scope_all && !irreversible,
         Step::Waiting | Step::Staging | Step::Staged => true,
-        _ => !is_offline(tx.view, board, &now, r),
+        _ => !is_out_of_reach(tx.view, board, &now, r),
     };
     if tx.view.robots_of(&rollout.rollout_id).any(open) {
         return;

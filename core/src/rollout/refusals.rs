@@ -4,7 +4,9 @@
 
 use super::rows::{Pause, Rollout, RolloutRobot, Step};
 use super::view::View;
+use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
+use std::collections::BTreeSet;
 
 /// So many robots hold a roll-out by refusing its content; in the first wave one does.
 const REFUSALS_HOLD: usize = 2;
@@ -19,6 +21,8 @@ pub fn of_content<'a>(view: &'a View, rollout: &'a Rollout) -> impl Iterator<Ite
 /// Why a roll-out has to stand still: robots refused its content, and one more than a person has seen.
 pub fn pause(view: &View, rollout: &Rollout) -> Option<Pause> {
     let refused: Vec<&RolloutRobot> = of_content(view, rollout).collect();
-    let holds = refused.len() >= REFUSALS_HOLD || refused.iter().any(|r| r.wave == 0);
-    (holds && refused.len() > rollout.refusals_passed as usize).then_some(Pause::Content)
+    // One that a person has seen may be on its way once more, and refuses nothing at this moment.
+    let named: BTreeSet<&RobotId> = rollout.refusals_seen.iter().chain(refused.iter().map(|r| &r.robot_id)).collect();
+    let holds = named.len() >= REFUSALS_HOLD || refused.iter().any(|r| r.wave == 0);
+    (holds && named.len() > rollout.refusals_seen.len()).then_some(Pause::Content)
 }

@@ -110,7 +110,7 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
 fn is_tried_again(now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
     let waited = waits_out(r).is_some_and(|wait_ms| now.ms_since(r.since) >= wait_ms);
     let at_the_end = rollout.second_pass && !r.again && is_retried(r);
-    rollout.phase == Phase::Applying && (waited || at_the_end)
+    rollout.may_go_on() && (waited || at_the_end)
 }
 
 /// It has the bundle for a second try that will not come.

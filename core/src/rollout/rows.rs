@@ -367,9 +367,9 @@ pub struct Rollout {
     /// How it ended. None: it is not completed, or was before that was kept.
     #[serde(default)]
     pub outcome: Option<Ending>,
-    /// Robots that had refused its content when a person resumed it last: they hold it no more.
+    /// Robots that had refused its content when a person resumed it: they hold it no more.
     #[serde(default)]
-    pub refusals_passed: u32,
+    pub refusals_seen: BTreeSet<RobotId>,
 }
 
 impl Rollout {

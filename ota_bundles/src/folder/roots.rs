@@ -9,7 +9,6 @@ use crate::repository::{PEOPLE_LIFE_MS, RootDraft, add_signatures, check_root, s
 use crate::roots::{Asked, Change, merge_root};
 use midshift_core::reason::Refusal;
 use midshift_core::time::Utc;
-use std::fs;
 
 /// A root that is not signed by enough people yet.
 const PENDING: &str = "pending.root.json";
@@ -88,9 +87,7 @@ impl Folder {
         }
         self.write(&format!("{version}.root.json"), &document)?;
         let pending = self.metadata().join(PENDING);
-        if pending.exists() {
-            fs::remove_file(&pending).map_err(io("removing", &pending))?;
-        }
+        midshift_durable::remove(&pending).map_err(io("removing", &pending))?;
         Ok(Signed::Published(version))
     }
 }

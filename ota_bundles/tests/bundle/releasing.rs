@@ -76,6 +76,18 @@ fn a_release_of_two_people_waits_for_the_second() {
 }
 
 #[test]
+fn a_waiting_document_that_cannot_be_looked_at_is_not_taken_for_absent() {
+    let place = tempfile::tempdir().expect("a folder");
+    let folder = folder(place.path(), Profile::Solo);
+    let key = key(place.path(), "targets-1.pem");
+    folder.add(&bundle(place.path(), "1.0.0", b"one"), &[&key], START).expect("signed");
+    let pending = place.path().join("repository/metadata/pending.targets.json");
+    std::os::unix::fs::symlink(&pending, &pending).expect("a link to itself");
+    assert!(matches!(folder.renew(&[&key], START), Err(Error::Io { .. })));
+    assert_eq!(folder.targets_version().expect("reads"), Some(1), "nothing was signed");
+}
+
+#[test]
 fn a_bundle_that_is_withdrawn_takes_along_only_what_no_other_has() {
     let place = tempfile::tempdir().expect("a folder");
     let folder = folder(place.path(), Profile::Team);

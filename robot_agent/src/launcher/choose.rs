@@ -1,7 +1,7 @@
 //! Which set starts next, and on which base the machine runs for it.
 //!
-//! Invariant: the switch record and the boot record are written here only, and only while no child runs. Called by the launcher between two
-//! starts. What is decided stands in [`crate::starts`] and [`crate::boot`]; here it is carried out.
+//! Invariant: the launcher writes the switch record and the boot record here only, and only while no child runs; while one runs, the agent writes
+//! them. Called by the launcher between two starts. What is decided stands in [`crate::starts`] and [`crate::boot`]; here it is carried out.
 
 use super::orders::Orders;
 use super::{PROGRAM, SWITCH, read_tries, say};

@@ -3,18 +3,18 @@
 use crate::release::{Bundle, Releases};
 use crate::rig::{Rig, action};
 use crate::sets::{put, set};
-use crate::updates::{committed, connected, name_of, on_trial, relaunch, state, switch, why};
+use crate::updates::{Order, committed, connected, name_of, on_trial, relaunch, stage, state, switch, want, why};
 use midshift_agent::core::ExitReason;
 use midshift_agent::memory::MemoryStore;
 use midshift_agent::sets::Sets;
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::store::Op;
-use midshift_agent::switch::FACTORY;
+use midshift_agent::switch::{FACTORY, Switch};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::Migration;
 use midshift_core::reason::Code;
 use midshift_core::robot::FAULT_SOFTWARE;
-use midshift_core::update::UpdateState;
+use midshift_core::update::{Goal, UpdateState};
 use midshift_core::work::Effect;
 use std::collections::BTreeSet;
 
@@ -47,6 +47,11 @@ fn started_again(rig: Rig) -> Rig {
 
 /// Puts a set onto the disk that nobody signed, and names it in the switch record as committed.
 fn forged(rig: &Rig) -> String {
+    forged_and(rig, Switch::commit)
+}
+
+/// The same, with the record as `change` makes it of one that has the set on trial.
+fn forged_and(rig: &Rig, change: impl FnOnce(&mut Switch)) -> String {
     let mut sets = disk(rig);
     let forged = set("6.6.6", b"forged program", b"forged settings");
     put(&mut sets, b"forged program");
@@ -54,7 +59,7 @@ fn forged(rig: &Rig) -> String {
     sets.stage(&forged).expect("stages");
     let mut switch = sets.holdings().expect("tells").switch;
     switch.try_out(&forged.id().to_string());
-    switch.commit();
+    change(&mut switch);
     sets.write_switch(&mut switch).expect("writes");
     forged.id().to_string()
 }
@@ -242,6 +247,83 @@ fn a_changed_program_on_trial_is_gone_back_from() {
     rig.pass(1_000);
     assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::RolledBack), Some(Code::RunningSetBad)));
     assert_eq!(switch(&rig).running(), FACTORY);
+}
+
+/// The process is killed when the ledger says that the set on trial is being committed, before the switch record does.
+fn begun_to_commit(mut rig: Rig, mut order: Order) -> Rig {
+    rig.slow_disk = true;
+    want(&mut rig, order.to(Goal::Commit));
+    let (_, ops) = rig.unwritten.take().expect("the ledger comes first");
+    rig.store.commit_now(&ops);
+    assert_eq!((state(&rig), is_intended(&rig)), (Some(UpdateState::Committing), true));
+    assert!(switch(&rig).trial.is_some());
+    rig
+}
+
+/// The ledger has a commit that the switch record is about to say.
+fn is_intended(rig: &Rig) -> bool {
+    let ledger = rig.store.kept().expect("loaded").ledger;
+    ledger.proven.is_some_and(|proven| proven.intended.is_some())
+}
+
+#[test]
+fn a_changed_program_is_not_committed_though_the_ledger_has_begun_to() {
+    let (rig, releases) = connected();
+    let bundle = releases.release("1.1.0");
+    let (rig, order) = on_trial(rig, &releases, &bundle, 1);
+    let rig = begun_to_commit(rig, order);
+    disk(&rig).rot(&bundle.manifest.components[0].digest);
+    let mut rig = relaunch(rig.restart());
+    rig.pass(1_000);
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::RolledBack), Some(Code::RunningSetBad)));
+    assert_eq!((switch(&rig).running(), is_intended(&rig)), (FACTORY, false));
+    assert_eq!(rig.store.kept().expect("loaded").ledger.software.committed_at, None);
+}
+
+#[test]
+fn a_commit_whose_set_was_put_away_before_it_is_believed_of_no_later_record() {
+    let (rig, releases) = connected();
+    let (rig, order) = on_trial(rig, &releases, &releases.release("1.1.0"), 1);
+    let rig = begun_to_commit(rig, order);
+    let name = name_of(&rig);
+    disk(&rig).fall_back(2);
+    let rig = started_again(rig);
+    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::RolledBack), Some(Code::ProgramCrashed)));
+    assert!(!is_intended(&rig));
+    // The record that was never written, by somebody else.
+    let mut sets = disk(&rig);
+    let mut record = switch(&rig);
+    record.try_out(&name);
+    record.commit();
+    sets.write_switch(&mut record).expect("writes");
+    let rig = rig.restart();
+    assert_eq!((rig.exit, switch(&rig).running()), (Some(ExitReason::Switched), FACTORY));
+}
+
+#[test]
+fn a_set_on_trial_that_nobody_signed_is_ended_beside_an_update_that_goes_on() {
+    for on_its_way in [UpdateState::Directed, UpdateState::Downloading, UpdateState::Staged] {
+        let (mut rig, releases) = connected();
+        let mut order = stage(&mut rig, &releases, &releases.release("1.1.0"), 1);
+        let mut software = rig.store.kept().expect("loaded").ledger.software;
+        let update = software.update.as_mut().expect("is staged");
+        update.state = on_its_way;
+        if on_its_way == UpdateState::Directed {
+            update.set = None;
+        }
+        rig.store.commit_now(&[Op::Software(Box::new(software))]);
+        let bad = forged_and(&rig, |_| {});
+        assert_eq!(switch(&rig).running(), bad);
+        let rig = rig.restart();
+        assert_eq!((rig.exit, switch(&rig).running()), (Some(ExitReason::Switched), FACTORY), "{on_its_way:?}");
+        assert_eq!(state(&rig), Some(on_its_way));
+        let mut rig = started_again(rig);
+        want(&mut rig, order.to(Goal::Stage));
+        rig.pass(2_000);
+        let told = rig.reported.as_ref().and_then(|reported| reported.update.as_ref()).map(|update| update.state);
+        assert_eq!((state(&rig), told), (Some(UpdateState::Staged), Some(UpdateState::Staged)), "{on_its_way:?}");
+        assert_eq!((offered(&mut rig, "T1"), works(&rig)), (vec![], true), "{on_its_way:?}");
+    }
 }
 
 #[test]

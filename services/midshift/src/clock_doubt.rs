@@ -6,7 +6,7 @@
 use anyhow::Context;
 use midshift_core::audit::Note;
 use midshift_core::rows::{Item, Log, Seq, Table, Writer};
-use midshift_core::time::{Clock, Utc};
+use midshift_core::time::{Clock, Now, Utc};
 use midshift_store::{Error, Store};
 use std::fs;
 use std::io::ErrorKind;
@@ -16,8 +16,10 @@ use std::time::{Duration, SystemTime};
 
 /// File of the data folder.
 const FILE: &str = "clock-accepted";
-/// File of the data folder while there is a doubt: the time before it, unix ms.
-const DOUBTED: &str = "clock-doubted";
+/// File of the data folder: the newest time that was in no doubt, unix ms.
+const BELIEVED: &str = "clock-believed";
+/// It is written anew when the clock is so far from it, milliseconds: much less than what puts a start in doubt.
+const BELIEVED_EVERY_MS: u64 = 3_600_000;
 /// What it is called in the audit.
 const ACTION: &str = "clock.accept";
 /// How often a server looks, real time.
@@ -39,39 +41,46 @@ pub fn leave_word(data: &Path) -> anyhow::Result<()> {
     fs::set_permissions(&path, fs::Permissions::from_mode(0o644)).with_context(|| format!("opening {}", path.display()))
 }
 
-/// Holds the clock of a start against the newest time that the store has.
+/// Holds the clock of a start against the newest time that the store has, and that was in no doubt.
 ///
 /// # Errors
-/// The store.
+/// The store, or a time that was kept and cannot be read.
 pub async fn check_start(data: &Path, clock: &dyn Clock, store: &dyn Store) -> anyhow::Result<()> {
     let newest = newest_time(store).await.context("reading the newest time of the store")?;
+    let before = believed(data)?;
     // What was written in doubt has the doubted time.
-    if let Some(newest) = newest.map(|newest| undoubted(data).map_or(newest, |before| before.min(newest))) {
+    if let Some(newest) = newest.map(|newest| before.map_or(newest, |before| before.min(newest))) {
         clock.check_start(newest);
     }
     if let Some(doubt) = clock.doubt() {
         let (ahead_s, newest) = (doubt.step_ms / 1_000, Utc(doubt.at.0.saturating_sub(doubt.step_ms)).rfc3339());
         tracing::error!(ahead_s, newest, "nothing is signed: the wall clock is far past what was written last");
     }
+    keep_believed(data, clock, before);
     Ok(())
 }
 
-/// The time before the doubt in which the run before ended; none: it ended without one.
-fn undoubted(data: &Path) -> Option<Utc> {
-    fs::read_to_string(data.join(DOUBTED)).ok()?.trim().parse().ok().map(Utc)
+/// The newest time that was in no doubt, of a run before; none: there was none.
+fn believed(data: &Path) -> anyhow::Result<Option<Utc>> {
+    let path = data.join(BELIEVED);
+    let reading = || format!("reading {}", path.display());
+    match fs::read_to_string(&path) {
+        Ok(text) => text.trim().parse().map(|ms| Some(Utc(ms))).with_context(reading),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(error).with_context(reading),
+    }
 }
 
-/// Keeps for the next start from when on nothing is believed, as long as there is a doubt.
-fn keep_doubt(data: &Path, clock: &dyn Clock) -> anyhow::Result<()> {
-    let path = data.join(DOUBTED);
-    let keeping = || format!("keeping {}", path.display());
-    match clock.doubt() {
-        Some(doubt) if undoubted(data).is_none() => {
-            let before = doubt.at.0.saturating_sub(doubt.step_ms);
-            midshift_durable::replace(&path, before.to_string().as_bytes()).with_context(keeping)
+/// Keeps the time for the next start while it is in no doubt, once it is far from what is `kept`. What is kept then.
+fn keep_believed(data: &Path, clock: &dyn Clock, kept: Option<Utc>) -> Option<Utc> {
+    let is_far = |now: &Now| kept.is_none_or(|kept| kept.0.abs_diff(now.wall.0) >= BELIEVED_EVERY_MS);
+    let Some(now) = clock.undoubted().ok().filter(is_far) else { return kept };
+    match midshift_durable::replace(&data.join(BELIEVED), now.wall.0.to_string().as_bytes()) {
+        Ok(()) => Some(now.wall),
+        Err(error) => {
+            tracing::warn!(%error, file = BELIEVED, "the time is not kept for the next start");
+            kept
         }
-        Some(_) => Ok(()),
-        None => midshift_durable::remove(&path).map(drop).with_context(keeping),
     }
 }
 
@@ -95,14 +104,12 @@ struct Read {
 
 /// Takes words until it is dropped.
 pub async fn run(data: &Path, clock: &dyn Clock, store: &dyn Store) {
-    let mut read = Read::default();
+    let (mut read, mut kept) = (Read::default(), None);
     loop {
         if let Err(error) = take_word(data, clock, store, &mut read).await {
             tracing::warn!(error = format!("{error:#}"), "a word about the clock was not taken: say it again");
         }
-        if let Err(error) = keep_doubt(data, clock) {
-            tracing::warn!(error = format!("{error:#}"), "a doubt about the clock is not kept for the next start");
-        }
+        kept = keep_believed(data, clock, kept);
         tokio::time::sleep(LOOK_EVERY).await;
     }
 }
@@ -194,26 +201,56 @@ mod tests {
         }
     }
 
+    /// The next run of the server, by the wall of this moment.
+    async fn started(data: &Path, wall: &AtomicI64, store: &MemoryStore) -> Arc<dyn Clock> {
+        let begun = Utc(wall.load(Relaxed));
+        let next: Arc<dyn Clock> = Arc::new(WallClock::new(|| 0, move || begun, |_| {}));
+        check_start(data, &*next, store).await.expect("read");
+        next
+    }
+
     #[tokio::test]
-    async fn a_doubt_outlives_a_restart_though_entries_were_written_meanwhile_and_ends_with_it() {
+    async fn a_restart_right_behind_a_jump_is_in_doubt_though_entries_were_written_meanwhile() {
         let dir = tempfile::tempdir().expect("a folder");
         let (wall, clock, store) = site();
         write(&store).await;
+        check_start(dir.path(), &*clock, &store).await.expect("it starts");
         wall.fetch_add(30 * DAY_MS, Relaxed);
         write(&store).await;
-        keep_doubt(dir.path(), &*clock).expect("kept");
-        let begun = Utc(wall.load(Relaxed));
-        let start = async |begun: Utc| {
-            let next = WallClock::new(|| 0, move || begun, |_| {});
-            check_start(dir.path(), &next, &store).await.expect("read");
-            next
-        };
-        assert!(start(begun).await.doubt().is_some());
+        // Nobody has looked at the clock since, and the process is killed; so is the next one.
+        for _ in 0..2 {
+            assert!(started(dir.path(), &wall, &store).await.doubt().is_some());
+            write(&store).await;
+        }
         wall.fetch_sub(30 * DAY_MS, Relaxed);
-        let right = start(Utc(wall.load(Relaxed))).await;
-        assert_eq!(right.doubt(), None, "the wall is right again");
-        keep_doubt(dir.path(), &right).expect("looked");
-        assert_eq!(fs::read_dir(dir.path()).expect("a folder").count(), 0);
+        assert_eq!(started(dir.path(), &wall, &store).await.doubt(), None, "the wall is right again");
+    }
+
+    #[tokio::test]
+    async fn a_wall_that_was_believed_is_believed_by_the_next_start() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let (wall, clock, store) = site();
+        write(&store).await;
+        let mut kept = keep_believed(dir.path(), &*clock, None);
+        for _ in 0..2 {
+            wall.fetch_add(30 * DAY_MS, Relaxed);
+            write(&store).await;
+            kept = keep_believed(dir.path(), &*clock, kept);
+            assert!(started(dir.path(), &wall, &store).await.doubt().is_some(), "nobody has said that it is right");
+            clock.accept_wall();
+            kept = keep_believed(dir.path(), &*clock, kept);
+            assert_eq!(started(dir.path(), &wall, &store).await.doubt(), None);
+        }
+        assert_eq!(keep_believed(dir.path(), &*clock, kept), kept);
+    }
+
+    #[tokio::test]
+    async fn a_time_that_cannot_be_read_is_an_error_and_not_absent() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let (_, clock, store) = site();
+        fs::write(dir.path().join(BELIEVED), "soon").expect("written");
+        let error = check_start(dir.path(), &*clock, &store).await.expect_err("refused");
+        assert!(format!("{error:#}").contains(BELIEVED), "{error:#}");
     }
 
     #[tokio::test]

@@ -73,7 +73,7 @@ pub fn open(folder: &Path, now: Utc) -> Result<Opened, Error> {
         Found::Torn => (Key::draw(), Some(Lost::KeyTorn)),
     };
     let is_drawn = key_lost.is_some();
-    let mut lost = match (path.exists(), key_lost) {
+    let mut lost = match (path.try_exists().map_err(failed)?, key_lost) {
         (true, _) => None,
         (false, Some(Lost::KeyGone)) if is_announced => None,
         (false, Some(Lost::KeyGone)) => Some(Lost::Folder),
@@ -134,4 +134,18 @@ fn stop_fleet(kept: &mut Kept, key: &Key, lost: Lost, now: Utc) -> Stop {
     key.mark(&mut stop);
     kept.latch.engage(stop.clone());
     stop
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_latch_that_cannot_be_looked_at_is_an_error_and_no_lost_memory() {
+        let folder = tempfile::tempdir().unwrap();
+        let latch = folder.path().join(LATCH);
+        std::os::unix::fs::symlink(&latch, &latch).unwrap();
+        assert!(matches!(open(folder.path(), Utc(1)), Err(Error::Folder { .. })));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing was written");
+    }
 }

@@ -85,7 +85,8 @@ impl Rig {
                     Fate::Refuses(code) => (UpdateState::Refused, Some(code.into())),
                     _ => (UpdateState::Staged, None),
                 };
-                self.tell(n, UpdateReport { reason, ..fresh_report(state, &bundle, generation) });
+                let grant_id = robot.seen_grant;
+                self.tell(n, UpdateReport { reason, grant_id, ..fresh_report(state, &bundle, generation) });
             }
             return;
         }

@@ -57,6 +57,14 @@ impl Rig {
         self.put(row);
     }
 
+    /// A robot shows another device key than the one that is known: this one.
+    pub(super) fn shows_another_key(&mut self, n: usize) -> String {
+        let key = "ab".repeat(32);
+        let session = self.row::<Session>(robot_id(n).as_str()).expect("it attached");
+        self.put(Session { other_device_key: Some(key.clone()), ..session });
+        key
+    }
+
     pub(super) fn retire(&mut self, n: usize) {
         let act = fleet::rows::Cordon { reason: String::new(), actor: "ana".into(), since: self.now.utc };
         self.control(n, |c| c.retired = Some(act));

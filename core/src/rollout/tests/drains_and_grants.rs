@@ -98,6 +98,30 @@ fn a_robot_that_was_killed_between_its_ledger_and_its_switch_record_gets_another
 }
 
 #[test]
+fn a_permission_lies_above_all_that_its_robot_has_used_though_the_store_has_forgotten_them() {
+    let mut rig = Rig::new(4);
+    // The clock was three days ahead, and the store was restored from a copy of before.
+    let used = rig.now.wall.plus_ms(3 * 24 * 3_600_000).0.cast_unsigned();
+    rig.robots.iter_mut().for_each(|r| r.seen_grant = used);
+    rig.start(spec());
+    rig.until(200, |r| r.phase() == Phase::Completed);
+    assert!(rig.robots.iter().all(|r| r.version == "2.0.0" && r.seen_grant > used));
+}
+
+#[test]
+fn a_robot_that_says_it_has_used_what_no_clock_gave_moves_no_number() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let n = rig.order()[0];
+    let used = crate::limits::GENERATION_FOLLOWED_MAX;
+    rig.robots[n].seen_grant = used;
+    rig.until(30, |r| r.of("ro", n).grant.is_some());
+    assert_eq!(rig.robots[n].report.as_ref().map(|report| report.grant_id), Some(used));
+    let number = rig.ota.clocks["ota"].row.number;
+    assert!(number <= rig.now.wall.0.cast_unsigned() + 10, "{number}");
+}
+
+#[test]
 fn in_flight_is_never_above_the_wave_nor_above_what_was_asked() {
     let mut rig = Rig::new(12);
     rig.start(RolloutSpec { max_in_flight: Some(3), ..wide() });

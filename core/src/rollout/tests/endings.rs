@@ -49,6 +49,21 @@ fn whom_a_person_keeps_out_was_not_offered_it() {
 }
 
 #[test]
+fn a_roll_out_that_was_offered_to_nobody_is_incomplete_and_says_why() {
+    let mut rig = Rig::new(3);
+    rig.start(spec());
+    for n in 0..3 {
+        rig.ask(&Command::Pin { robot_id: robot_id(n), reason: "a trade fair".into() }).expect("allowed");
+    }
+    rig.until(60, |r| r.phase() == Phase::Completed);
+    assert_eq!((rig.count(Step::Skipped), outcome(&rig, "ro")), (3, Some(Ending::Incomplete)));
+    let told = rig.feed.iter().rfind(|e| &*e.kind == crate::maintenance::INCIDENT).and_then(|e| e.body.as_ref());
+    let told: Reason = serde_json::from_str(told.expect("a person is told")).expect("a reason");
+    assert_eq!((told.code, told.metadata["offered"].as_str()), (Code::RolloutIncomplete, "0"));
+    assert!(told.text().contains("pinned"), "{}", told.text());
+}
+
+#[test]
 fn whoever_had_the_bundle_already_ends_with_it() {
     let mut rig = Rig::new(4);
     rig.start(RolloutSpec { complete_percent: 100, ..spec() });

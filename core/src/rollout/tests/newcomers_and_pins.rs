@@ -117,14 +117,6 @@ fn a_robot_that_is_pinned_stays_at_what_it_runs_however_far_it_is() {
     assert_eq!(rig.robots.iter().filter(|r| r.version == "2.0.0").count(), 2);
 }
 
-/// A robot shows another device key than the one that is known.
-fn shows_another_key(rig: &mut Rig, n: usize) -> String {
-    let key = "ab".repeat(32);
-    let session = rig.row::<Session>(robot_id(n).as_str()).expect("it attached");
-    rig.put(Session { other_device_key: Some(key.clone()), ..session });
-    key
-}
-
 #[test]
 fn a_robot_that_shows_another_device_key_and_was_not_enrolled_since_gets_nothing_however_far_it_is() {
     let mut rig = Rig::new(4);
@@ -133,7 +125,7 @@ fn a_robot_that_shows_another_device_key_and_was_not_enrolled_since_gets_nothing
     rig.robots[canary].fate = Fate::NeverReady;
     rig.until(20, |r| r.step(canary) == Step::Activating && r.step(other) == Step::Staged);
     for n in [canary, other] {
-        shows_another_key(&mut rig, n);
+        rig.shows_another_key(n);
     }
     rig.until(300, |r| r.phase() == Phase::Completed);
     for n in [canary, other] {
@@ -148,7 +140,7 @@ fn a_robot_that_shows_another_device_key_and_was_not_enrolled_since_gets_nothing
 fn another_device_key_that_a_person_took_keeps_a_robot_from_nothing() {
     let mut rig = Rig::new(4);
     for n in 0..4 {
-        let device_key = shows_another_key(&mut rig, n);
+        let device_key = rig.shows_another_key(n);
         rig.tick();
         let command = Command::AcceptKey { robot_id: robot_id(n), device_key };
         rig.ask(&command).expect("allowed");

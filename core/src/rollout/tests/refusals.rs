@@ -1,5 +1,7 @@
 //! What robots refuse: each refusal keeps its meaning, and content that is not what was signed holds a roll-out.
 
+use super::super::refusals;
+use super::super::robots::{self, Move};
 use super::super::rows::Pause;
 use super::*;
 
@@ -58,8 +60,37 @@ fn behind_the_first_wave_two_robots_hold_it_and_after_a_resume_only_one_more_doe
     assert!(is_held(&rig));
     rig.must("ro", Verb::Resume);
     rig.ticks(3);
-    assert!(!is_held(&rig), "a person has seen these two");
+    let seen = BTreeSet::from([robot_id(order[3]), robot_id(order[4])]);
+    assert_eq!((is_held(&rig), rig.rollout("ro").refusals_seen), (false, seen), "a person has seen these two");
     finds_other_bytes(&mut rig, order[5]);
     rig.tick();
     assert!(is_held(&rig));
+}
+
+#[test]
+fn a_person_has_seen_robots_and_not_so_many_of_them() {
+    let mut rig = Rig::new(6);
+    rig.start(RolloutSpec { soak_ms: 600_000, ..spec() });
+    let order = rig.order();
+    rig.robots[order[3]].fate = Fate::Refuses(Code::BundleCorrupt);
+    rig.until(60, |r| r.phase() == Phase::Soaking);
+    assert_eq!(why(&rig, order[3]), Code::BundleCorrupt);
+    let seen = |n: usize| Rollout { refusals_seen: BTreeSet::from([robot_id(n)]), ..rig.rollout("ro") };
+    assert_eq!(refusals::pause(&rig.ota, &seen(order[3])), None);
+    // That one is tried once more, and refuses nothing at this moment.
+    assert_eq!(refusals::pause(&rig.ota, &seen(order[4])), Some(Pause::Content), "nobody has seen the other");
+}
+
+#[test]
+fn nobody_is_tried_again_while_the_roll_out_stands_still() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    rig.until(5, |r| r.phase() == Phase::Applying);
+    let rollout = Rollout { second_pass: true, ..rig.rollout("ro") };
+    let refused = Some(Code::MetadataRefused.into());
+    let r = RolloutRobot { step: Step::Skipped, why: refused, ..rig.of("ro", rig.order()[1]) };
+    let due = |rollout: &Rollout| robots::next(&rig.ota, &rig.board, &rig.now, rollout, &r);
+    assert_eq!(due(&rollout), Some(Move::Again));
+    let held = Rollout { pauses: BTreeSet::from([Pause::Content]), ..rollout };
+    assert_eq!(due(&held), None, "its refusal would be forgotten, and the roll-out go on");
 }

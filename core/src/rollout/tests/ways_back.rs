@@ -115,6 +115,85 @@ fn a_stuck_robot_that_was_set_up_anew_is_told_as_back_and_one_that_runs_the_bund
     }
 }
 
+/// What a robot waits for, and what a person can do.
+fn waits_for(rig: &Rig, n: usize) -> Option<Reason> {
+    let (rollout, r) = (rig.rollout("ro"), rig.of("ro", n));
+    super::super::explain::blocked(&rig.ota, &rig.board, &rig.now, &rollout, &r).map(|blocked| blocked.by)
+}
+
+/// The robot waits for a person to say whose machine shows this key, and no order is signed for it.
+fn assert_held_back(rig: &Rig, n: usize, device_key: &str, last: u64) {
+    let by = waits_for(rig, n).expect("it waits");
+    let named = [by.metadata["robot_id"].as_str(), by.metadata["device_key"].as_str()];
+    assert_eq!((by.code, named), (Code::SkippedOtherKey, [robot_id(n).as_str(), device_key]));
+    assert!(by.code.next_step().contains("--accept-key"), "{}", by.code.next_step());
+    let told = rig.row::<DesiredUpdate>(robot_id(n).as_str()).map_or(0, |d| d.generation);
+    assert!(told <= last, "{told} was signed");
+    assert_eq!((rig.step(n), rig.phase()), (Step::Reverting, Phase::Aborted), "and its roll-out waits for nobody");
+}
+
+fn accept(rig: &mut Rig, n: usize, device_key: String) {
+    rig.ask(&Command::AcceptKey { robot_id: robot_id(n), device_key }).expect("allowed");
+}
+
+#[test]
+fn no_order_back_is_signed_for_a_machine_with_another_key_until_a_person_takes_it() {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    rig.must("ro", Verb::Abort);
+    rig.robots[n].is_off = true;
+    rig.until(60, |r| r.step(n) == Step::Reverting);
+    // What it was told is gone, as after a restore: only a directive of its own can tell it again.
+    let last = section(&rig, n).generation;
+    rig.write(Key::new(DesiredUpdate::TABLE, robot_id(n).as_str()), None, "test.gone");
+    let device_key = rig.shows_another_key(n);
+    rig.robots[n].is_off = false;
+    rig.ticks(60);
+    assert_held_back(&rig, n, &device_key, last);
+    accept(&mut rig, n, device_key);
+    rig.until(60, |r| r.step(n) == Step::RolledBack);
+    assert!(section(&rig, n).generation > last);
+}
+
+#[test]
+fn a_mended_robot_that_shows_another_key_is_not_ordered_back_until_a_person_takes_it() {
+    let mut rig = half();
+    let n = rig.order()[0];
+    rig.robots[n].fate = Fate::KeepsNothing;
+    rig.must("ro", Verb::Abort);
+    rig.until(100, |r| r.phase() == Phase::Aborted);
+    rig.robots[n].fate = Fate::Good;
+    let last = section(&rig, n).generation;
+    let device_key = rig.shows_another_key(n);
+    rig.ask(&unstick(n)).expect("it is stuck");
+    rig.ticks(30);
+    assert_held_back(&rig, n, &device_key, last);
+    accept(&mut rig, n, device_key);
+    rig.until(30, |r| r.step(n) == Step::RolledBack);
+    assert!(section(&rig, n).generation > last, "by an order of its own");
+}
+
+#[test]
+fn a_roll_out_that_takes_another_back_waits_for_nobody_whose_key_a_person_must_take() {
+    let n = 2;
+    let mut rig = left_another(n);
+    rig.robots[n].fate = Fate::Stubborn;
+    take_back(&mut rig);
+    rig.until(60, |r| r.of("back", n).way_back.generation > 0);
+    let first = section(&rig, n).directive;
+    let device_key = rig.shows_another_key(n);
+    rig.until(200, |r| r.rollout("back").phase == Phase::Completed);
+    let r = rig.of("back", n);
+    assert_eq!((r.step, r.way_back.refused.is_some()), (Step::Reverting, true), "it is not ordered back anew");
+    assert_eq!(section(&rig, n).directive, first);
+    rig.robots[n].fate = Fate::Good;
+    accept(&mut rig, n, device_key);
+    rig.until(60, |r| r.of("back", n).step == Step::RolledBack);
+    assert_ne!(section(&rig, n).directive, first);
+}
+
 #[test]
 fn what_a_stuck_robot_said_before_it_was_mended_does_not_make_it_stuck_again() {
     let mut rig = half();

@@ -15,8 +15,7 @@ use midshift_identity::RevocationList;
 use midshift_identity::restored::{self, TABLES, Tokens};
 use midshift_store::SqliteRestored;
 use std::fmt;
-use std::fs::{self, Permissions};
-use std::os::unix::fs::PermissionsExt;
+use std::fs;
 use std::path::{Path, PathBuf};
 
 /// What is to become of tokens, where a person says it.
@@ -143,10 +142,30 @@ fn nothing() -> (Item, Settled) {
 
 /// The list goes on in the restored server: what it names, and these rows do not know, may be in a later backup.
 fn keep(list: &Path, folder: &Path) -> anyhow::Result<()> {
-    if !folder.is_dir() {
-        return Ok(());
-    }
+    let lines = fs::read(list).with_context(|| format!("reading {}", list.display()))?;
+    midshift_identity::make_folder(folder)
+        .with_context(|| format!("keeping what was taken back: {} must be a folder", folder.display()))?;
     let to = folder.join(RevocationList::FILE);
-    fs::copy(list, &to).with_context(|| format!("copying {}", list.display()))?;
-    fs::set_permissions(&to, Permissions::from_mode(0o600)).with_context(|| format!("closing {}", to.display()))
+    midshift_durable::replace_with(&to, &lines, midshift_durable::PRIVATE)
+        .with_context(|| format!("writing {}", to.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::PermissionsExt;
+
+    #[test]
+    fn the_list_goes_on_also_where_the_backup_had_no_keys_and_never_where_no_folder_can_be() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let at = |name: &str| dir.path().join(name);
+        fs::write(at("list"), "{}\n").expect("written");
+        keep(&at("list"), &at("identity")).expect("kept");
+        let kept = at("identity").join(RevocationList::FILE);
+        let mode = |path: &Path| fs::metadata(path).expect("there").permissions().mode() & 0o777;
+        assert_eq!((mode(&at("identity")), mode(&kept)), (0o700, 0o600));
+        assert_eq!(fs::read_to_string(kept).expect("read"), "{}\n");
+        let error = keep(&at("list"), &at("list")).expect_err("a file is there");
+        assert!(format!("{error:#}").contains("must be a folder"), "{error:#}");
+    }
 }

@@ -33,7 +33,7 @@ impl Part for Stops {
     async fn copy(&self, from: &Places, folder: &Path, _said: &mut Said) -> anyhow::Result<bool> {
         let (from, folder) = (from.data.join(FOLDER), folder.to_owned());
         blocking(move || {
-            let (has_latch, has_key) = (from.join(LATCH).exists(), from.join(KEY).exists());
+            let (has_latch, has_key) = (is_there(&from.join(LATCH))?, is_there(&from.join(KEY))?);
             if !has_latch && !has_key {
                 return Ok(false);
             }
@@ -80,6 +80,11 @@ impl Part for Stops {
     }
 }
 
+/// One that cannot be looked at is not absent: a backup would leave it out.
+fn is_there(path: &Path) -> anyhow::Result<bool> {
+    path.try_exists().with_context(|| format!("looking for {}", path.display()))
+}
+
 fn private(folder: &Path) -> anyhow::Result<()> {
     fs::create_dir_all(folder)?;
     fs::set_permissions(folder, fs::Permissions::from_mode(0o700))?;
@@ -97,4 +102,22 @@ fn latch(from: &Path, folder: &Path) -> anyhow::Result<()> {
         }
     }
     copied.map_or(Ok(()), |error| Err(error).context("copying the latch"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn files_of_stops_that_cannot_be_looked_at_are_left_out_of_no_backup() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let from = Places { data: dir.path().join("data"), ota_keys: None, store: None };
+        let latch = from.data.join(FOLDER).join(LATCH);
+        fs::create_dir_all(from.data.join(FOLDER)).expect("a folder");
+        let to = dir.path().join("backup");
+        assert!(!Stops.copy(&from, &to, &mut Said::default()).await.expect("there is nothing"));
+        std::os::unix::fs::symlink(&latch, &latch).expect("a link to itself");
+        let error = Stops.copy(&from, &to, &mut Said::default()).await.expect_err("nobody knows");
+        assert!(format!("{error:#}").contains(LATCH), "{error:#}");
+    }
 }

@@ -73,7 +73,7 @@ fn soaking(bundle: BundleId) -> Rollout {
         resumed: None,
         since: Utc(0),
         outcome: None,
-        refusals_passed: 0,
+        refusals_seen: BTreeSet::new(),
     }
 }
 
