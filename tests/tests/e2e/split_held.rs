@@ -1,6 +1,6 @@
-//! What holds changes of software on a site of several processes over PostgreSQL, as people say it and are told of it at
-//! its public address: a pin, a freeze, a pause, a clock in doubt, a bundle that is taken back. By the bodies' journals
-//! nobody changes while any of it stands.
+//! What holds changes of software on a site of several processes over PostgreSQL, as people say it and are told of it
+//! at its public address: a pin, a freeze, a pause, a clock in doubt, a bundle that is taken back. By the bodies'
+//! journals nobody changes while any of it stands.
 
 use crate::harness::{folder, until};
 use crate::identity::json;
