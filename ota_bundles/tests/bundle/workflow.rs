@@ -29,6 +29,9 @@ fn meta(document: &[u8], version: u64) -> Value {
     json!({"length": document.len(), "hashes": {"sha256": Digest::of(document).to_string()}, "version": version})
 }
 
+/// Seed of a key of no role.
+const STRANGER: u8 = 99;
+
 /// A repository that has a document replaced, and all above it signed anew by the right keys, as whoever stole those could.
 struct Forge(Shelf);
 
@@ -206,10 +209,11 @@ async fn step_5_3_11_other_online_keys_begin_anew_after_a_fast_forward() {
 #[tokio::test]
 async fn step_5_4_2_a_timestamp_is_signed_by_its_key() {
     let (shelf, robot) = repository().await;
-    let mut forge = Forge(shelf);
-    let by = key(forge.0.seeds.snapshot);
-    forge.put("timestamp.json", forged(&forge.document("timestamp.json"), &by, |_| {}));
-    forge.refused(&robot, "VerifyMetadata").await;
+    for by in [shelf.seeds.snapshot, STRANGER] {
+        let mut forge = Forge(shelf.clone());
+        forge.put("timestamp.json", forged(&forge.document("timestamp.json"), &key(by), |_| {}));
+        forge.refused(&robot, "VerifyMetadata").await;
+    }
 }
 
 #[tokio::test]
@@ -260,11 +264,12 @@ async fn steps_5_5_2_to_5_5_4_a_snapshot_is_the_one_that_the_timestamp_names_and
     let first = other.document("1.snapshot.json");
     other.put("2.snapshot.json", first.clone());
     other.refused(&robot, "Transport").await;
-    let mut stranger = Forge(shelf.clone());
-    let by = key(shelf.seeds.timestamp);
-    let forgery = forged(&stranger.document("2.snapshot.json"), &by, |_| {});
-    stranger.stamp(&forgery, 2);
-    stranger.refused(&robot, "VerifyMetadata").await;
+    for by in [shelf.seeds.timestamp, STRANGER] {
+        let mut other = Forge(shelf.clone());
+        let forgery = forged(&other.document("2.snapshot.json"), &key(by), |_| {});
+        other.stamp(&forgery, 2);
+        other.refused(&robot, "VerifyMetadata").await;
+    }
     let mut renamed = Forge(shelf);
     renamed.stamp(&first, 2);
     renamed.refused(&robot, "VersionMismatch").await;
@@ -291,12 +296,14 @@ async fn steps_5_6_2_to_5_6_4_targets_are_those_that_the_snapshot_names_and_sign
     let mut other = Forge(shelf.clone());
     other.put("2.targets.json", first.clone());
     other.refused(&robot, "Transport").await;
-    let mut stranger = Forge(shelf.clone());
-    let evil = [target("walk-6.6.6.manifest", b"evil")];
-    let ends = START.plus_ms(PEOPLE_LIFE_MS);
-    let forgery = sign_targets(Some(&second), &evil, &[], ends, &[&key(shelf.seeds.snapshot)]).expect("signed");
-    stranger.snap(2, &forgery, 3);
-    stranger.refused(&robot, "VerifyMetadata").await;
+    for by in [shelf.seeds.snapshot, STRANGER] {
+        let mut other = Forge(shelf.clone());
+        let evil = [target("walk-6.6.6.manifest", b"evil")];
+        let ends = START.plus_ms(PEOPLE_LIFE_MS);
+        let forgery = sign_targets(Some(&second), &evil, &[], ends, &[&key(by)]).expect("signed");
+        other.snap(2, &forgery, 3);
+        other.refused(&robot, "VerifyMetadata").await;
+    }
     let mut renamed = Forge(shelf);
     renamed.snap(2, &second, 3);
     renamed.refused(&robot, "VersionMismatch").await;

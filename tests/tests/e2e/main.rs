@@ -57,6 +57,7 @@ mod rolling;
 mod room;
 mod secrets;
 mod split;
+mod split_held;
 mod split_restored;
 mod stack;
 mod stop_alone;

@@ -1,7 +1,7 @@
 //! A night at a site of somebody who has the programs and nothing else: `serve`, robots under launchers, tasks without
-//! end, a good release and bad ones. The server, launchers and agents are killed at work, and a freeze comes in the
-//! middle of a wave. In the whole night somebody pauses it too, the disk of one robot is full, and another falls silent
-//! for ever.
+//! end, a good release and bad ones. The server, launchers and agents are killed at work, and a freeze and a pause come
+//! in the middle of a wave. In the whole night the disk of one robot is full too, and another falls silent for ever: a
+//! silent robot is lost after a minute at the earliest.
 //!
 //! Invariant: it is judged by what bodies wrote of themselves and by what launchers start next. `MIDSHIFT_SEED` decides
 //! who is killed and when; `MIDSHIFT_NIGHT=all` plays the whole night instead of a short one.
@@ -118,12 +118,16 @@ struct Plot {
     /// Of a hundred robots of an area, so many may be out of work at once.
     off_work: &'static str,
     waves: &'static str,
+    /// Robots out of work for the good release at once.
+    max_in_flight: &'static str,
+    /// Permissions between the end of the freeze and the pause.
+    between_stays: usize,
     bad: &'static [Bad],
     /// Who is killed how often.
     blows: [(Blow, usize); 3],
     /// So many of these kills come with each bad release.
     blows_each: usize,
-    /// With a pause, a full disk and a robot that falls silent.
+    /// With a full disk and a robot that falls silent.
     is_whole: bool,
 }
 
@@ -131,9 +135,11 @@ const SHORT: Plot = Plot {
     robots: 5,
     off_work: "50",
     waves: "1,rest",
+    max_in_flight: "2",
+    between_stays: 0,
     bad: &[AT_START],
     blows: [(Blow::Server, 3), (Blow::Launcher, 1), (Blow::Agent, 1)],
-    blows_each: 2,
+    blows_each: 1,
     is_whole: false,
 };
 
@@ -141,6 +147,8 @@ const WHOLE: Plot = Plot {
     robots: 12,
     off_work: "25",
     waves: "1,50%,rest",
+    max_in_flight: "12",
+    between_stays: 1,
     bad: &[AT_START, HANGS, SLOW],
     blows: [(Blow::Server, 9), (Blow::Launcher, 3), (Blow::Agent, 2)],
     blows_each: 3,
@@ -167,14 +175,18 @@ impl Post {
     fn journal(&self) -> PathBuf {
         self.home.join("data/journal.jsonl")
     }
-    /// When its body first wrote that it runs this version.
-    fn began(&self, version: &str) -> anyhow::Result<Option<i64>> {
-        let ran = |effect: &Effect| matches!(effect, Effect::Ran { version: began } if began == version);
-        Ok(journal::read(&self.journal())?.into_iter().find(|entry| ran(&entry.effect)).map(|entry| entry.utc_ms))
+    /// Each version that its body wrote it runs, and when, in their order.
+    fn ran(&self) -> anyhow::Result<Vec<(String, i64)>> {
+        let entries = journal::read(&self.journal())?.into_iter();
+        let ran = entries.filter_map(|entry| match entry.effect {
+            Effect::Ran { version } => Some((version, entry.utc_ms)),
+            _ => None,
+        });
+        Ok(ran.collect())
     }
 }
 
-/// A time in which no robot began to run a version, but for those that had permission before.
+/// A time in which no robot begins to run a version, but for those that had permission before.
 struct Hold {
     what: String,
     version: &'static str,
@@ -326,7 +338,7 @@ impl Night {
     fn ran(&self, version: &str) -> anyhow::Result<BTreeSet<&str>> {
         let mut ran = BTreeSet::new();
         for post in &self.posts {
-            if post.began(version)?.is_some() {
+            if post.ran()?.iter().any(|(ran, _)| ran == version) {
                 ran.insert(post.id.as_str());
             }
         }
@@ -353,8 +365,7 @@ impl Night {
         until("everybody on what it keeps", LIMIT, async || {
             for post in &self.posts {
                 let keeps = if self.is_out(post) {
-                    // Before its first change of software there is no record.
-                    !post.robot.switch().is_ok_and(|switch| switch.trial.is_some() || switch.running() != FACTORY)
+                    post.robot.switch()?.running() == FACTORY
                 } else {
                     !post.robot.is_on_trial() && post.robot.committed()?.as_deref() == Some(GOOD)
                 };
@@ -460,13 +471,16 @@ impl Night {
         })
         .await?;
         stay.put(&self.address, id, true)?;
-        let (from_ms, before) = until("nobody on the way to a permission", LIMIT, async || {
-            let from_ms = now_ms();
-            let rows = self.rows(id).await?.filter(|rows| !rows.iter().any(is_on_its_way));
-            Ok(rows.map(|rows| (from_ms, permitted(&rows))))
+        let from_ms = now_ms();
+        // The item that permits relies on what was just said: who has no permission now gets none.
+        let rows = until("its robots", LIMIT, async || self.rows(id).await).await?;
+        let before = permitted(&rows);
+        ensure!(is_amid(&rows, had, 1), "{stay:?} of {id} holds nobody back: {before:?} have had permission");
+        say!("{stay:?} of {id}: {before:?} have had permission");
+        until("nobody on the way to a permission", LIMIT, async || {
+            Ok(self.rows(id).await?.filter(|rows| !rows.iter().any(is_on_its_way)).map(drop))
         })
         .await?;
-        say!("{stay:?} of {id}: {before:?} have had permission");
         self.strike().await?;
         self.until_done(1).await?;
         let to_ms = now_ms();
@@ -517,19 +531,25 @@ impl Night {
         let told = incidents(self.server.address)?;
         let is_told = told.iter().any(|i| i["robotId"] == robot.as_str() && i["reason"]["code"] == code);
         ensure!(is_told, "no incident of {robot}: {told:?}");
-        done(&["rollout", "lost", "--server", &self.address, id, &robot, "--reason", "nobody finds it"])
+        done(&["rollout", "lost", "--server", &self.address, id, &robot, "--reason", "nobody finds it"])?;
+        let rows = until("its robots", LIMIT, async || self.rows(id).await).await?;
+        let is_given_up = |row: &RolloutRobot| row.robot_id == robot && row.written_off.is_some();
+        ensure!(rows.iter().any(is_given_up), "{robot} holds others up: {rows:?}");
+        Ok(())
     }
     /// The good release, in the middle of which all the rest happens.
     async fn good(&mut self) -> anyhow::Result<()> {
-        let id = self.begin(GOOD, self.plot.waves, &["--probation", "1s", "--exposure-tasks", "0"])?;
+        let at_once = ["--max-in-flight", self.plot.max_in_flight];
+        let flags = [&at_once[..], &["--probation", "1s", "--exposure-tasks", "0"]].concat();
+        let id = self.begin(GOOD, self.plot.waves, &flags)?;
         until("its canary on trial", LIMIT, async || {
             Ok(self.posts.iter().any(|post| post.robot.is_on_trial()).then_some(()))
         })
         .await?;
         self.strike().await?;
         let had = self.stay(Stay::Freeze, &id, GOOD, 2).await?;
+        self.stay(Stay::Pause, &id, GOOD, had + self.plot.between_stays).await?;
         if self.plot.is_whole {
-            self.stay(Stay::Pause, &id, GOOD, had + 1).await?;
             self.fall_silent(&id).await?;
             self.strike().await?;
         }
@@ -537,9 +557,9 @@ impl Night {
         self.wait(&id, "completed", 0)?;
         self.until_kept().await?;
         let rows = until("its robots", LIMIT, async || self.rows(&id).await).await?;
-        for row in rows.iter().filter(|row| self.full.as_ref() == Some(&row.robot_id)) {
-            let why = row.why.as_ref().map(|why| why.code.as_str());
-            ensure!(why == Some(Code::NoRoom.as_str()), "it has no room: {row:?}");
+        if let Some(full) = &self.full {
+            let why = rows.iter().find(|row| row.robot_id == *full).and_then(|row| row.why.as_ref());
+            ensure!(why.is_some_and(|why| why.code == Code::NoRoom.as_str()), "{full} has no room: {rows:?}");
         }
         let ran = self.ran(GOOD)?;
         let has_it = |post: &&Post| !self.is_out(post);
@@ -567,14 +587,25 @@ impl Night {
         ensure!(ran.len() == 1, "{id}: its canary alone runs it, and {ran:?} did");
         Ok(())
     }
-    /// By the journals: nobody first ran a version while it was held.
+    /// By the journals: nobody without permission began to run a version while it was held.
     fn judge_holds(&self) -> anyhow::Result<()> {
         for hold in &self.holds {
             let Hold { what, version, from_ms, to_ms, permitted } = hold;
             for post in self.posts.iter().filter(|post| !permitted.contains(&post.id)) {
-                let inside = post.began(version)?.filter(|began| (*from_ms..*to_ms).contains(began));
-                ensure!(inside.is_none(), "{} ran {version} first at {inside:?}, after {what} at {from_ms}", post.id);
+                let begun = post.ran()?.into_iter().find(|(ran, at)| ran == version && (*from_ms..*to_ms).contains(at));
+                ensure!(begun.is_none(), "{} began {begun:?} after {what} at {from_ms}", post.id);
             }
+        }
+        Ok(())
+    }
+    /// By the journals: everybody runs what it keeps, which is the good release, or what it came with without that.
+    fn judge_kept(&self) -> anyhow::Result<()> {
+        for post in &self.posts {
+            let ran = post.ran()?;
+            let runs = ran.last().map(|(version, _)| version.as_str());
+            let came_with = ran.first().map(|(version, _)| version.as_str());
+            let keeps = if self.is_out(post) { came_with } else { Some(GOOD) };
+            ensure!(runs.is_some() && runs == keeps, "{} runs {runs:?} and keeps {keeps:?}", post.id);
         }
         Ok(())
     }
@@ -594,6 +625,8 @@ async fn played(dir: &Path, plot: &'static Plot, seed: u64) -> anyhow::Result<()
     enough.cancel();
     let asked = asking.await??;
     let ended = all_over(address, asked).await?;
+    night.until_kept().await?;
+    night.judge_kept()?;
     night.judge_holds()?;
     let journals: Vec<PathBuf> = night.posts.iter().map(Post::journal).collect();
     say!("{asked} tasks; a person may be asked about {:?}", night.inside);

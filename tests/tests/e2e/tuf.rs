@@ -1,6 +1,7 @@
 //! A client of TUF that is not ours, python-tuf, on a real server: it takes what people signed and nothing else.
 //!
-//! The lies are told by a small server between the two, and on the disk of ours; each is followed by the truth, which is taken.
+//! The lies are told by a small server between the two, some of them with keys that a thief has, and on the disk of ours.
+//! The attacks have the names that the TUF specification gives them in its security goals.
 
 use crate::harness::{Server, command, sign_in, tool};
 use crate::secrets::heard;
@@ -10,9 +11,12 @@ use std::process::Command;
 
 /// A robot that trusts python-tuf, and a liar: `python robot.py PART SERVER ROOT WORK`.
 const CLIENT: &str = r#"
-import datetime, os, shutil, ssl, sys, threading, urllib.error, urllib.request
+import datetime, os, ssl, sys, threading, urllib.error, urllib.request
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from securesystemslib.signer import CryptoSigner
 from tuf.api import exceptions
+from tuf.api.metadata import Metadata, MetaFile, TargetFile
 from tuf.ngclient import FetcherInterface, Updater
 
 part, server, root, work = sys.argv[1:]
@@ -86,6 +90,53 @@ def kept(name):
     with open(os.path.join(work, name), "rb") as file:
         return file.read()
 
+def signer(role):
+    with open(root, "rb") as file:
+        first = Metadata.from_bytes(file.read()).signed
+    with open(f"keys/{role}-1.pem", "rb") as file:
+        secret = load_pem_private_key(file.read(), None)
+    return CryptoSigner(secret, first.keys[first.roles[role].keyids[0]])
+
+def later(signed):
+    signed.version += 1
+
+def lasting(signed):
+    later(signed)
+    signed.expires = datetime.datetime.now(datetime.timezone.utc) + datetime.timedelta(days=30)
+
+def forward(signed):
+    signed.version = 1_000_000
+
+def forged(name, by, change=later):
+    document = Metadata.from_bytes(get(name))
+    change(document.signed)
+    document.sign(by)
+    return document.to_bytes()
+
+def newest():
+    snapshot = Metadata.from_bytes(get("timestamp.json")).signed.snapshot_meta.version
+    return snapshot, Metadata.from_bytes(get(f"{snapshot}.snapshot.json")).signed.meta["targets.json"].version
+
+def stamp(snapshot, version, change=later):
+    def name_it(signed):
+        change(signed)
+        signed.snapshot_meta = MetaFile.from_data(version, snapshot, ["sha256"])
+    lies[f"{version}.snapshot.json"] = snapshot
+    lies["timestamp.json"] = forged("timestamp.json", signer("timestamp"), name_it)
+
+def snap(targets, version):
+    at, _ = newest()
+    def name_them(signed):
+        later(signed)
+        signed.meta["targets.json"] = MetaFile.from_data(version, targets, ["sha256"])
+    lies[f"{version}.targets.json"] = targets
+    stamp(forged(f"{at}.snapshot.json", signer("snapshot"), name_them), at + 1)
+
+def attacked(attack, error):
+    client(attack).refresh()
+    refused(attack, error, client(attack, between).refresh)
+    lies.clear()
+
 if part == "first":
     robot = client("robot")
     robot.refresh()
@@ -121,6 +172,58 @@ elif part == "second":
     frozen._trusted_set.reference_time = datetime.datetime.now(datetime.timezone.utc) + datetime.timedelta(days=2)
     refused("a timestamp that was frozen", exceptions.ExpiredMetadataError, frozen.refresh)
     client("frozen").refresh()
+elif part == "thief":
+    stranger = CryptoSigner.generate_ed25519()
+    snapshot, targets = newest()
+    def seized(signed):
+        later(signed)
+        for role in ("root", "targets", "snapshot", "timestamp"):
+            signed.add_key(stranger.public_key, role)
+    def evil(signed):
+        later(signed)
+        signed.targets["gait-6.6.6.component"] = TargetFile.from_data("gait-6.6.6.component", b"evil")
+    unsigned = exceptions.UnsignedMetadataError
+    lies["2.root.json"] = forged("1.root.json", stranger, seized)
+    attacked("a root by a key of no role", unsigned)
+    lies["timestamp.json"] = forged("timestamp.json", stranger)
+    attacked("a timestamp by a key of no role", unsigned)
+    stamp(forged(f"{snapshot}.snapshot.json", stranger), snapshot + 1)
+    attacked("a snapshot by a key of no role", unsigned)
+    snap(forged(f"{targets}.targets.json", stranger, evil), targets + 1)
+    attacked("targets by a key of no role", unsigned)
+    snap(forged(f"{targets}.targets.json", signer("snapshot"), evil), targets + 1)
+    attacked("targets by a key of another role", unsigned)
+    stamp(kept("1.snapshot.json"), 1)
+    attacked("a snapshot that was rolled back", exceptions.BadVersionNumberError)
+    snap(kept("1.targets.json"), 1)
+    attacked("targets that were rolled back", exceptions.BadVersionNumberError)
+    stamp(get(f"{snapshot}.snapshot.json"), snapshot, lasting)
+    frozen = client("a snapshot that was frozen", between)
+    frozen._trusted_set.reference_time = datetime.datetime.now(datetime.timezone.utc) + datetime.timedelta(days=8)
+    refused("a snapshot that was frozen", exceptions.ExpiredMetadataError, frozen.refresh)
+    lies.clear()
+    robot = client("robot", between)
+    robot.refresh()
+    name = "gait-1.6.0.component"
+    lies[f"{robot.get_targetinfo(name).hashes['sha256']}.{name}"] = b"runs" * 100_000
+    refused("a file without an end", exceptions.DownloadError, lambda: download(robot, name))
+    lies[f"{robot.get_targetinfo(name).hashes['sha256']}.{name}"] = b"evil"
+    refused("another file", exceptions.RepositoryError, lambda: download(robot, name))
+    lies.clear()
+    assert download(robot, name) == b"runs"
+    stamp(forged(f"{snapshot}.snapshot.json", signer("snapshot"), forward), 1_000_000, forward)
+    client("driven").refresh()
+    client("driven", between).refresh()
+    lies.clear()
+    refused("what is honest after a fast-forward", exceptions.BadVersionNumberError, client("driven").refresh)
+elif part == "rotated":
+    driven = client("driven")
+    driven.refresh()
+    assert download(driven, "gait-1.6.0.component") == b"runs"
+    lies["timestamp.json"] = forged("timestamp.json", signer("timestamp"))
+    refused("a timestamp by a key that was stolen", exceptions.UnsignedMetadataError, client("driven", between).refresh)
+    lies.clear()
+    client("driven", between).refresh()
 elif part == "tampered":
     robot = client("late")
     robot.refresh()
@@ -179,8 +282,22 @@ pub fn python(dir: &Path, server: &Server, part: &str, repository: &str) -> anyh
     Ok(String::from_utf8(ran.stdout)?.lines().map(str::to_owned).collect())
 }
 
+/// Other keys for the server, as if its own had been stolen: the root names them, and it signs with them.
+async fn change_keys(dir: &Path, server: &mut Server) -> anyhow::Result<()> {
+    for role in ["snapshot", "timestamp"] {
+        let (old, new) = (format!("keys/{role}-1.pem"), format!("keys/{role}-2.pem"));
+        let rotate = ["bundle", "root", "rotate", "--repository", "repository", "--role", role];
+        release(dir, &[&rotate[..], &["--drop", &old, "--key", &new]].concat())?;
+    }
+    release(dir, &["bundle", "root", "sign", "--repository", "repository", "--key", "keys/root-1.pem"])?;
+    // It reads keys when it starts.
+    server.kill_and_restart().await?;
+    release(dir, &["bundle", "sign", "--renew", "--repository", "repository", "--key", "keys/targets-1.pem"])?;
+    release(dir, &["bundle", "push", "repository", "--server", &server.address.to_string()])
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn python_tuf_takes_releases_and_refuses_lies() -> anyhow::Result<()> {
+async fn python_tuf_takes_releases_and_refuses_each_attack() -> anyhow::Result<()> {
     let dir = tempfile::tempdir()?;
     let dir = dir.path();
     release(dir, &["bundle", "keygen", "--keys", "keys", "--repository", "repository"])?;
@@ -201,6 +318,22 @@ async fn python_tuf_takes_releases_and_refuses_lies() -> anyhow::Result<()> {
         "refused: a timestamp that was frozen",
     ];
     assert_eq!(python(dir, &server, "second", "repository")?, refused);
+    let refused = [
+        "refused: a root by a key of no role",
+        "refused: a timestamp by a key of no role",
+        "refused: a snapshot by a key of no role",
+        "refused: targets by a key of no role",
+        "refused: targets by a key of another role",
+        "refused: a snapshot that was rolled back",
+        "refused: targets that were rolled back",
+        "refused: a snapshot that was frozen",
+        "refused: a file without an end",
+        "refused: another file",
+        "refused: what is honest after a fast-forward",
+    ];
+    assert_eq!(python(dir, &server, "thief", "repository")?, refused);
+    change_keys(dir, &mut server).await?;
+    assert_eq!(python(dir, &server, "rotated", "repository")?, ["refused: a timestamp by a key that was stolen"]);
     let content = dir.join("data/ota/content");
     let mut tampered = 0;
     for entry in std::fs::read_dir(content)? {

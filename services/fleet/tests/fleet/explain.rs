@@ -36,6 +36,21 @@ async fn no_robot_is_available() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_task_that_was_accepted_a_moment_ago_waits_for_the_planner_that_has_not_read_it() {
+    let mut w = World::on(CORRIDOR).await;
+    let head = *w.store.wake().borrow();
+    w.shaky.feed_up_to(Some(head));
+    w.submit("T1", "A", "B").await;
+    w.pass(1).await;
+    let told = of_task(&w, "T1").await;
+    assert_eq!(told.code, Code::WaitingInQueue.as_str(), "{told:?}");
+    assert_eq!(told.metadata["waits_for"], "the planner: it has not read the task yet");
+    w.shaky.feed_up_to(None);
+    w.pass(2).await;
+    assert_eq!(why(&w, "T1").await, codes(Code::WaitingForRobot, ""));
+}
+
+#[tokio::test(start_paused = true)]
 async fn no_robot_has_the_capability() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;

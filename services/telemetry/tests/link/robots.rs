@@ -7,8 +7,10 @@ use midshift_core::robot::{Inventory, Mode, ReportedState, Vitals};
 use midshift_core::rows::{Item, Writer};
 use midshift_core::time::Clock;
 use midshift_core::work::{LastHeard, PresenceRow, Session};
+use midshift_proto::access::local;
 use midshift_proto::convert::{ms_of, time_of};
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
+use midshift_proto::telemetry::v1::telemetry_service_server::TelemetryService;
 use midshift_proto::telemetry::v1::{
     self, GetRobotRequest, ListRobotsRequest, Presence, RobotFilter, WatchRobotsRequest, WatchRobotsResponse,
 };
@@ -17,6 +19,7 @@ use midshift_telemetry::{Bugs, Parts};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
+use tokio_stream::StreamExt;
 use tonic::Streaming;
 
 struct Watcher(Streaming<WatchRobotsResponse>);
@@ -217,6 +220,50 @@ async fn pages_of_robots_are_full_as_long_as_more_match_and_the_last_one_says_so
     }
     let presences = vec![Presence::Online.into()];
     assert!(paged(&world, RobotFilter { presences, ..RobotFilter::default() }).await?.is_empty());
+    Ok(())
+}
+
+/// Robots open sessions and are not heard.
+async fn open(store: &dyn Store, ids: &[String]) -> Result<()> {
+    let mut item = Item::new(Writer::Telemetry, "tests");
+    for id in ids {
+        item.create(&session(id, Inventory::default())?, "session.opened");
+    }
+    assert!(store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn robots_that_change_or_come_while_the_whole_is_told_are_told_once_more_and_none_is_left_out() -> Result<()> {
+    let clock = clock();
+    let store: Arc<dyn Store> =
+        Arc::new(MemoryStore::new(SiteId::parse("s")?, StoreId(Arc::from("store-1")), clock.clone()));
+    let ids = |numbers: std::ops::RangeInclusive<u32>| numbers.map(|n| format!("r{n:02}")).collect::<Vec<_>>();
+    open(&*store, &ids(1..=60)).await?;
+    let world = begin(&store, &clock).await?;
+    while paged(&world, RobotFilter::default()).await?.len() < 60 {}
+    // Not over a connection, which reads ahead: a message is composed once it is asked for.
+    let request = WatchRobotsRequest { period_ms: 50, ..WatchRobotsRequest::default() };
+    let mut watch = world.service.watch_robots(local(request)).await?.into_inner();
+    let mut next = async || -> Result<(Vec<String>, bool)> {
+        let told = watch.next().await.ok_or("the watch ended")??;
+        Ok((told.robots.into_iter().map(|robot| robot.robot_id).collect(), told.snapshot_complete))
+    };
+    assert_eq!(next().await?, (ids(1..=24), false));
+
+    // One that was told changes and one that was not; one comes before those that were told and one behind them.
+    let mut item = Item::new(Writer::Fleet, "tests");
+    for id in ["r03", "r30"] {
+        let labels = BTreeMap::from([("floor".to_owned(), "2".to_owned())]);
+        item.create(&RobotControl { labels, ..RobotControl::new(RobotId::parse(id)?) }, "robot.labeled");
+    }
+    assert!(store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
+    open(&*store, &["r00", "r24-b"].map(str::to_owned)).await?;
+    while paged(&world, RobotFilter::default()).await?.len() < 62 {}
+    assert_eq!(next().await?, ([vec!["r24-b".to_owned()], ids(25..=47)].concat(), false));
+    assert_eq!(next().await?, (ids(48..=60), true));
+    assert_eq!(next().await?, (["r00", "r03", "r24-b", "r30"].map(str::to_owned).to_vec(), true));
+    assert!(tokio::time::timeout(Duration::from_secs(20), next()).await.is_err(), "each once, and nobody else");
     Ok(())
 }
 

@@ -34,6 +34,8 @@ pub struct Shaky {
     reads_for: Mutex<Duration>,
     /// A reading of the feed takes so long.
     feeds_for: Mutex<Duration>,
+    /// The feed ends here.
+    feeds_up_to: Mutex<Option<Seq>>,
     /// Rows and entries that were read through this handle.
     rows_read: AtomicU64,
     /// Whole pictures that were read through this handle.
@@ -51,6 +53,7 @@ impl Shaky {
             narrow: Mutex::new(None),
             reads_for: Mutex::new(Duration::ZERO),
             feeds_for: Mutex::new(Duration::ZERO),
+            feeds_up_to: Mutex::new(None),
             rows_read: AtomicU64::new(0),
             pictures_read: AtomicU64::new(0),
             inner,
@@ -86,6 +89,10 @@ impl Shaky {
     /// From now on a reading of the feed takes so long.
     pub fn feed_for(&self, time: Duration) {
         *self.feeds_for.lock().expect("not poisoned") = time;
+    }
+    /// From now on the feed ends here for whoever reads it through this handle, or where it does.
+    pub fn feed_up_to(&self, head: Option<Seq>) {
+        *self.feeds_up_to.lock().expect("not poisoned") = head;
     }
     /// Rows and entries read through this handle since the last call.
     pub fn rows_read(&self) -> u64 {
@@ -234,7 +241,11 @@ impl Store for Shaky {
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {
         self.thaws().await;
         takes(&self.feeds_for).await;
-        let page = self.inner.feed(after, logs, limit).await?;
+        let mut page = self.inner.feed(after, logs, limit).await?;
+        if let Some(head) = *self.feeds_up_to.lock().expect("not poisoned") {
+            page.entries.retain(|entry| entry.seq <= head);
+            (page.next, page.head) = (page.next.min(head), page.head.min(head));
+        }
         self.count(page.entries.len());
         Ok(page)
     }
