@@ -183,6 +183,8 @@ pub const READY_WITHIN: SiteDuration = SiteDuration::from_secs(600);
 pub const STAGED_WITHIN: SiteDuration = SiteDuration::from_secs(3_600);
 /// A stop by the maker's safety system counts against a bundle for so long after the change to it.
 pub const HARDWARE_STOP_COUNTS: SiteDuration = SiteDuration::from_secs(600);
+/// A robot that stands for a place is written down after so long, and again each time after it.
+pub const PLACE_WAIT_NOTED: SiteDuration = SiteDuration::from_secs(60);
 /// A robot on trial that has work and stands for so long is jammed by its bundle, if the others are not.
 pub const JAMMED_AFTER: SiteDuration = SiteDuration::from_secs(300);
 /// Robots that are compared with those that are not heard: fewer tell nothing.

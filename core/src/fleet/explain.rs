@@ -199,11 +199,11 @@ fn barring(why: Option<&Reason>) -> Option<&Reason> {
     why.filter(|why| why.code == Code::PlaceBlocked && !why.message.is_empty())
 }
 
-/// The robot carries what is of no task that waits for it, or of one that waits for a person, or what a person has put back.
+/// The robot carries what is of no task that waits for it, of one that waits for a person or for its next try, or what a person has put back.
 fn carries(view: &View, board: &Board, robot_id: &RobotId) -> Option<Reason> {
     let load = load::carried(view, board.get(robot_id)?)?;
     let task = load.task_id.as_ref().and_then(|id| view.task(id));
-    let asks = task.is_some_and(|task| task.phase == Phase::NeedsOperator);
+    let asks = task.is_some_and(|task| matches!(task.phase, Phase::NeedsOperator | Phase::RetryWait));
     let is_its_own = |task: &TaskState| {
         let is_item = view.intake(&task.task_id).is_some_and(|intake| load::is_item_of(load, task, intake));
         is_item && task.opened.as_ref().is_none_or(|r| r == robot_id)
@@ -212,6 +212,11 @@ fn carries(view: &View, board: &Board, robot_id: &RobotId) -> Option<Reason> {
         return None;
     }
     let reason = match task.filter(|_| asks) {
+        Some(task) if task.phase == Phase::RetryWait => {
+            let at = task.retry_at.map_or_else(|| "later".to_owned(), |at| format!("at {}", at.rfc3339()));
+            let told = format!("The robot carries an item of task {}, which goes on with it {at}.", task.task_id);
+            Reason::new(Code::RobotLoaded, told).with("item", &load.item).with(WAITS_FOR, format!("the next try {at}"))
+        }
         Some(task) => {
             let told = format!("The robot carries an item of task {}, which waits for a person's word.", task.task_id);
             let resolve = format!("a person: midshift task resolve {}", task.task_id);

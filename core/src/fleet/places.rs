@@ -7,7 +7,7 @@
 use super::Tx;
 use super::anchor::next_generation;
 use super::desired::{Release, Releases};
-use super::rows::{HolderState, Place, PlaceHolder};
+use super::rows::{HolderState, Place, PlaceHolder, RobotControl};
 use super::view::{View, Waiting};
 use super::{Board, Plan, plausible, starts, way};
 use crate::ids::{AreaId, PlaceId, RobotId};
@@ -17,7 +17,7 @@ use crate::site::route::{Segment, segments};
 use crate::site::{AreaIx, Kind, PlaceIx};
 use crate::task::spec::Class;
 use crate::task::{Attempt, AttemptPhase};
-use crate::time::{Now, SiteDuration, SiteTime};
+use crate::time::{Now, SiteDuration, SiteTime, Utc};
 use crate::work::{Assignment, Live};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -218,12 +218,24 @@ fn serve(tx: &mut Tx, live: &Live, releases: &mut Releases, traffic: &mut Traffi
     tx.view.place_waits += u64::from(!tx.view.waits.contains_key(robot_id));
     let since = tx.view.waits.entry(robot_id.clone()).or_insert(Waiting { places: Vec::new(), since: now }).since;
     tx.view.waits.insert(robot_id.clone(), Waiting { places: names, since });
+    note_wait(tx, robot_id, since);
     if step_aside(tx, &a, &work, since, releases, traffic) {
         return;
     }
     // Who lost places may stand in them.
     let kept = if is_whole { kept_free(tx.view, robot_id, &needed, traffic) } else { needed };
     traffic.blocked.extend(kept);
+}
+
+/// Writes down once a minute that the robot stands for a place: who judges its software must not blame it for that.
+fn note_wait(tx: &mut Tx, robot_id: &RobotId, since: SiteTime) {
+    let is_long = tx.now.site.since(since) >= limits::PLACE_WAIT_NOTED;
+    let Some(control) = tx.view.control.get(robot_id.as_str()).map(|c| &c.row).filter(|_| is_long) else { return };
+    let is_noted = |at: Utc| tx.now.ms_since(at) < limits::PLACE_WAIT_NOTED.as_ms();
+    if !control.waited_for_place.is_some_and(is_noted) {
+        let control = RobotControl { waited_for_place: Some(tx.now.utc), ..control.clone() };
+        tx.put(control, "robot.waits");
+    }
 }
 
 /// Places that a wish keeps free for itself. While there is no seat where it goes to, only that seat: who leaves the seat may need the same

@@ -148,6 +148,9 @@ pub struct RobotControl {
     /// Since when it gets no offers because it answers none, UTC, site clock: the newest that it missed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unanswered_since: Option<Utc>,
+    /// When it last stood for a place and had done so for a minute, UTC, site clock; written once a minute meanwhile.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub waited_for_place: Option<Utc>,
     /// Attempts that no row knows and that a person told the server to ignore, as long as the robot lists them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub disowned: Vec<AttemptId>,
@@ -177,6 +180,7 @@ impl RobotControl {
             failures: Vec::new(),
             unanswered: Vec::new(),
             unanswered_since: None,
+            waited_for_place: None,
             disowned: Vec::new(),
             load_settled: None,
             errands: 0,

@@ -1,7 +1,7 @@
 //! Whether a robot on trial that stands with its work is jammed by its bundle, or stands as the others do.
 //!
 //! Invariant: it is blamed only while at least [`limits::CONTROLS_MIN`] robots that do not try this bundle have work too, and most of them
-//! get on with it. Whom a stop, a person or its own safety system holds is not jammed.
+//! get on with it. Whom a stop, a person or its own safety system holds is not jammed, nor who stands for a place that it was not given.
 
 use super::Board;
 use super::infrastructure::is_open_to;
@@ -32,8 +32,11 @@ fn stood(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Option<Si
         |state: WorkState| matches!(state, WorkState::Accepted | WorkState::Navigating | WorkState::Executing);
     let has_work = live.report.attempts.iter().any(|a| is_on_its_way(a.state));
     // Before the start of the service nobody watched.
-    let since = live.progress_at.max(view.started.site);
-    (has_work && !is_held(live)).then(|| now.site.since(since))
+    let stood = now.site.since(live.progress_at.max(view.started.site));
+    let waited = view.control.get(robot_id.as_str()).and_then(|control| control.row.waited_for_place);
+    let since_wait = waited.map(|at| SiteDuration(now.ms_since(at)));
+    let waits = since_wait.is_some_and(|since| since.as_ms() < 2 * limits::PLACE_WAIT_NOTED.as_ms());
+    (has_work && !is_held(live) && !waits).then(|| since_wait.map_or(stood, |since| stood.min(since)))
 }
 
 fn is_held(live: &Live) -> bool {

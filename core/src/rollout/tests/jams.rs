@@ -14,8 +14,9 @@ fn has_work(rig: &mut Rig, n: usize, gets_on: bool) {
     (live.report.attempts, live.progress_at) = (vec![listed], progress_at);
 }
 
-/// One canary on trial that stands with its work, and five others with work, of which so many get on, for as long as a jam takes.
-fn stands(others_get_on: usize, held: bool) -> (Rig, usize) {
+/// One canary on trial that stands with its work, held by a stop or waiting for a place or neither, and five others with work, of which so many get
+/// on, for as long as a jam takes.
+fn stands(others_get_on: usize, held: bool, waits: bool) -> (Rig, usize) {
     let mut rig = Rig::new(6);
     rig.works = false;
     rig.checks_rebuild = false;
@@ -26,6 +27,10 @@ fn stands(others_get_on: usize, held: bool) -> (Rig, usize) {
         rig.pass(10_000);
         for (place, n) in order.iter().enumerate() {
             has_work(&mut rig, *n, place > 0 && place <= others_get_on);
+        }
+        if waits {
+            let now = rig.now.utc;
+            rig.control(order[0], |control| control.waited_for_place = Some(now));
         }
         if held {
             let live = rig.board.get_mut(&robot_id(order[0])).expect("it is heard");
@@ -38,15 +43,15 @@ fn stands(others_get_on: usize, held: bool) -> (Rig, usize) {
 
 #[test]
 fn a_canary_that_stands_with_its_work_while_others_get_on_fails_its_trial() {
-    let (rig, n) = stands(5, false);
+    let (rig, n) = stands(5, false, false);
     assert_eq!(rig.of("ro", n).failure.map(|f| f.code), Some(Code::JammedOnTrial));
     assert!(rig.rollout("ro").abort.is_some_and(|abort| abort.reason.code == Code::FailureAmongFew));
 }
 
 #[test]
-fn where_the_others_stand_too_or_a_stop_holds_it_nothing_is_held_against_the_bundle() {
-    for (others_get_on, held) in [(3, false), (0, false), (5, true)] {
-        let (rig, n) = stands(others_get_on, held);
-        assert_eq!(rig.of("ro", n).failure, None, "{others_get_on} {held}");
+fn where_the_others_stand_too_or_a_stop_or_a_place_holds_it_nothing_is_held_against_the_bundle() {
+    for (others_get_on, held, waits) in [(3, false, false), (0, false, false), (5, true, false), (5, false, true)] {
+        let (rig, n) = stands(others_get_on, held, waits);
+        assert_eq!(rig.of("ro", n).failure, None, "{others_get_on} {held} {waits}");
     }
 }

@@ -1,11 +1,12 @@
 //! Why not: each case has a reason that names what is in the way.
 
-use crate::harness::{World, jam};
+use crate::harness::{World, jam, obstacle};
 use midshift_core::fleet::rows::HolderState;
 use midshift_core::reason::Code;
 use midshift_core::robot::{HardwareStop, Load, Mode};
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
+use midshift_core::task::raw::RawRetry;
 use midshift_proto::access::local;
 use midshift_proto::common::v1::Reason;
 use midshift_proto::fleet::v1;
@@ -222,6 +223,27 @@ async fn a_robot_that_waits_for_a_place_names_its_holder() {
     let (code, waits_for) = of_both(&w, "T2", "r2").await;
     assert_eq!(code, "PLACE_BLOCKED");
     assert!(waits_for.contains("B") && waits_for.contains("r1"), "{waits_for}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_whose_task_waits_for_its_next_try_is_told_when_that_is() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").fails = Some((2, obstacle()));
+    let in_ten_minutes = RawRetry { max_retry_times: 1, interval_ms: Some(600_000), ..RawRetry::default() };
+    w.submit_with("T1", "A", "B", |raw| raw.retry = Some(in_ten_minutes.clone())).await;
+    let waits = |s: &crate::harness::Seen| s.phase("T1") == Phase::RetryWait && s.is_free("r1");
+    let seen = w.until("it carries its item and has nothing to do", waits).await;
+    w.pass(2).await;
+    let at = seen.task("T1").retry_at.expect("a time").rfc3339();
+    let told = of_robot(&w, "r1").await;
+    assert_eq!(
+        (told.code.as_str(), told.metadata["waits_for"].clone()),
+        ("ROBOT_LOADED", format!("the next try at {at}"))
+    );
+    assert_eq!(told.metadata["task_id"], "T1");
+    w.until_phase("T1", Phase::Succeeded).await;
+    w.lawful().await;
 }
 
 #[tokio::test(start_paused = true)]

@@ -38,6 +38,28 @@ async fn the_second_robot_waits_before_an_exclusive_passage_and_goes_when_the_fi
 }
 
 #[tokio::test(start_paused = true)]
+async fn who_stands_for_a_place_for_a_minute_is_written_down_each_minute() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    w.robot("r2", "park-b").await;
+    for (task, robot, from) in [("T1", "r1", "A"), ("T2", "r2", "B")] {
+        w.submit_with(task, from, "charge", |raw| {
+            (raw.robot_id, raw.stall_ms) = (robot.to_owned(), Some(3_600_000));
+        })
+        .await;
+        w.until("it has its way, or stands for it", |s| s.has("r1", "corridor")).await;
+        w.r("r1").drives = false;
+    }
+    w.until("r2 stands before it", |s| s.holders("wait-b") == [("r2".to_owned(), HolderState::Inside)]).await;
+    w.pass_while(30, "not yet a minute", |s| s.control("r2").waited_for_place.is_none()).await;
+    let seen = w.until("it is written down", |s| s.control("r2").waited_for_place.is_some()).await;
+    let first = seen.control("r2").waited_for_place;
+    w.until("it is written down again", |s| s.control("r2").waited_for_place > first).await;
+    assert_eq!(w.seen().await.control("r1").waited_for_place, None);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_place_that_a_robot_says_it_is_in_is_nobody_elses_though_no_heartbeat_has_said_so_yet() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
