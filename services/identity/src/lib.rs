@@ -17,7 +17,7 @@ mod revocation_list;
 mod tokens;
 
 pub use authority::PUBLIC_FILE;
-pub use files::make_folder;
+pub use files::{FOLDER, make_folder};
 pub use proof::ServerProof;
 pub use retention::prune;
 pub use revocation_list::RevocationList;

@@ -25,9 +25,6 @@ use std::time::Duration;
 use tokio::net::{TcpListener, UdpSocket};
 use tokio_util::sync::CancellationToken;
 
-/// The folder of keys and certificates below the data folder.
-pub const IDENTITY: &str = "identity";
-
 /// Robots change gateways in a second or two when they are told to; this is for those that are slow to answer.
 const DRAIN_DEFAULT_S: u64 = 20;
 
@@ -148,7 +145,7 @@ impl Software {
 impl Serve {
     /// The folder of the keys of this process.
     fn own_keys(&self) -> PathBuf {
-        self.identity.clone().unwrap_or_else(|| self.data.join(IDENTITY))
+        self.identity.clone().unwrap_or_else(|| self.data.join(midshift_identity::FOLDER))
     }
 
     /// What holds for the stop service beside it too, as arguments: its port has the same peers, and its log goes where this one's does.

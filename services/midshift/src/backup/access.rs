@@ -5,7 +5,6 @@
 
 use super::blocking;
 use super::part::Making;
-use crate::serve::IDENTITY;
 use anyhow::{Context, bail};
 use midshift_core::identity::Revocation;
 use midshift_core::ids::SiteId;
@@ -109,7 +108,7 @@ impl Access {
             }
         };
         if let Some(list) = self.revocations.clone() {
-            blocking(move || keep(&list, &data.join(IDENTITY))).await?;
+            blocking(move || keep(&list, &data.join(midshift_identity::FOLDER))).await?;
         }
         Ok(settled)
     }
