@@ -726,4 +726,4 @@ impl Record for OtaClock {
 }
 
 /// A used request_id of a command.
-pub type CommandKey = crate::once::CommandKey<super::commands::Command>;
+pub type CommandKey = crate::once::CommandKey<super::requests::Command>;

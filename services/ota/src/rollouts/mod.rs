@@ -23,7 +23,7 @@ use midshift_core::ids::RolloutId;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::bugs::Bugs;
-use midshift_core::rollout::commands::{Ask, CheckOnly, Command, Taken};
+use midshift_core::rollout::requests::{Ask, CheckOnly, Command, Taken};
 use midshift_core::rollout::spec::PROBATION_DEFAULT_MS;
 use midshift_core::rollout::view::View;
 use midshift_core::rows::{Revision, Seq};
