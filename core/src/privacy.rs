@@ -99,9 +99,9 @@ pub const PRECISE_MS: u64 = limits::POSITION_PRECISE_HOURS * HOUR_MS;
 /// Something that outlives the call that it came in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Place {
-    /// Rows.
+    /// Rows of one table of the store.
     Table(Table),
-    /// Entries.
+    /// Entries of one log of the store.
     Log(Log),
     /// STATUS samples as they came, in telemetry.db.
     Samples,
@@ -135,7 +135,7 @@ impl Place {
 /// One place and what it holds.
 #[derive(Clone, Copy, Debug)]
 pub struct Kept {
-    /// Where.
+    /// The place that outlives the call.
     pub place: Place,
     /// What: the first is what the place is there for, the others come with it.
     pub holds: &'static [DataClass],

@@ -239,7 +239,7 @@ pub struct Downlink {
 pub struct StopFacts {
     /// Engaged and not reset.
     pub stops: Vec<Stop>,
-    /// Reset.
+    /// Resets, each of one stop by its id.
     pub resets: Vec<Reset>,
 }
 

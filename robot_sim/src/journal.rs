@@ -103,7 +103,7 @@ pub enum Effect {
     },
     /// The robot obeys another level of operational stop from now on.
     Obeys {
-        /// Which.
+        /// The level that it obeys from then on.
         level: StopLevel,
         /// Millimetres driven so far.
         odometer_mm: u64,

@@ -25,7 +25,7 @@ const COMMAND: &str = "command";
 /// What is closed of one place.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Closure {
-    /// Which.
+    /// The place with something closed.
     pub place_id: PlaceId,
     /// In words, with the robots and the command that opens it.
     pub reason: Reason,

@@ -19,7 +19,7 @@ pub enum Verb {
     Submit,
     /// Stand for it.
     Approve,
-    /// Begin.
+    /// Begin with the first wave.
     Start {
         /// Roll-outs that have some of the robots are aborted first.
         supersede: bool,
@@ -53,37 +53,37 @@ pub enum Command {
     },
     /// Take a completed roll-out back with another.
     Rollback {
-        /// Which.
+        /// The completed roll-out that is taken back.
         of: RolloutId,
         /// Id of the other.
         rollout_id: RolloutId,
     },
     /// Something about one.
     Do {
-        /// Which.
+        /// The roll-out that it is about.
         rollout_id: RolloutId,
-        /// What.
+        /// What is to happen to it.
         verb: Verb,
         /// Why; may be empty.
         reason: String,
     },
     /// Take a bundle back: nobody gets it any more.
     Revoke {
-        /// Which.
+        /// The bundle that nobody gets any more.
         bundle: BundleId,
-        /// Why.
+        /// Why, in a person's words.
         reason: String,
     },
     /// Keep a robot at what it runs.
     Pin {
-        /// Whom.
+        /// The robot that keeps its software.
         robot_id: RobotId,
-        /// Why.
+        /// Why, in a person's words.
         reason: String,
     },
     /// Let it take part again.
     Unpin {
-        /// Whom.
+        /// The robot that roll-outs may reach again.
         robot_id: RobotId,
     },
     /// A person mended what kept the robot from going back: it is told to go back once more.
@@ -102,9 +102,9 @@ pub enum Command {
     },
     /// A person has looked: the robot may have the bundle again.
     LiftQuarantine {
-        /// Whom.
+        /// The robot that is in quarantine.
         robot_id: RobotId,
-        /// Which.
+        /// The bundle that it may have again.
         bundle: BundleId,
     },
 }
@@ -128,7 +128,7 @@ impl once::Asked for Command {
 /// A command as somebody asks for it.
 #[derive(Clone, Debug)]
 pub struct Ask {
-    /// What.
+    /// The command, not yet checked.
     pub command: Command,
     /// Only if the roll-out is still as this says.
     pub seen: Option<Revision>,

@@ -60,9 +60,9 @@ async fn prune(parts: &Parts, task: Option<TaskService>) {
 pub struct Turn<'t> {
     /// Rows and entries.
     pub store: &'t dyn Store,
-    /// Samples.
+    /// The log of STATUS samples.
     pub frames: &'t dyn FrameLog,
-    /// Clocks.
+    /// The clock that ages are held against.
     pub clock: &'t dyn Clock,
     /// Intake of tasks, in a process that has it.
     pub task: Option<&'t TaskService>,

@@ -134,9 +134,9 @@ pub struct Release {
 /// Who publishes, and when.
 #[derive(Clone, Debug)]
 pub struct Act {
-    /// Who.
+    /// The actor that publishes.
     pub by: Actor,
-    /// When.
+    /// When it publishes, UTC of the wall.
     pub at: Utc,
 }
 

@@ -13,7 +13,7 @@ use midshift_store::{Error, FrameLog, Query, Store};
 /// The oldest of one place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Oldest {
-    /// Where.
+    /// The place that was looked into.
     pub place: Place,
     /// What the place is there for.
     pub class: DataClass,
