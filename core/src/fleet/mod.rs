@@ -155,7 +155,7 @@ impl Plan {
         let outline = tx.outline();
         let view = tx.take_back();
         if !is_aside {
-            refused::note(view, outline);
+            refused::note_refusal(view, outline);
         }
         false
     }

@@ -230,7 +230,7 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         served = server.serve(listener) => served,
         () = keep_stop(beside, &*rows) => Ok(()),
         () = backup::told::run(&args.data, &*rows) => Ok(()),
-        () = clock_jump::keep(&args.data, &*clock) => Ok(()),
+        () = clock_jump::keep_jumps(&args.data, &*clock) => Ok(()),
         () = clock_doubt::run(&args.data, &*clock, &*rows) => Ok(()),
     };
     storage.close().await;

@@ -317,7 +317,7 @@ impl StopService {
         let following = async {
             tokio::select! {
                 () = shutdown.cancelled() => {}
-                () = snapshot::keep(&inner, self.folder.clone()) => {}
+                () = snapshot::follow_files(&inner, self.folder.clone()) => {}
             }
         };
         tokio::join!(disk::keep(&inner, writer), moving, following);

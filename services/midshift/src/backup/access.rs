@@ -108,7 +108,7 @@ impl Access {
             }
         };
         if let Some(list) = self.revocations.clone() {
-            blocking(move || keep(&list, &data.join(midshift_identity::FOLDER))).await?;
+            blocking(move || copy_list(&list, &data.join(midshift_identity::FOLDER))).await?;
         }
         Ok(settled)
     }
@@ -141,7 +141,7 @@ fn nothing() -> (Item, Settled) {
 }
 
 /// The list goes on in the restored server: what it names, and these rows do not know, may be in a later backup.
-fn keep(list: &Path, folder: &Path) -> anyhow::Result<()> {
+fn copy_list(list: &Path, folder: &Path) -> anyhow::Result<()> {
     if !folder.is_dir() {
         return Ok(());
     }
