@@ -63,7 +63,7 @@ pub enum Error {
     NoKeyFile {
         /// Where they should be.
         folder: PathBuf,
-        /// Whose.
+        /// The role whose keys are missing.
         role: &'static str,
     },
     /// None of the server's keys may sign.
@@ -73,7 +73,7 @@ pub enum Error {
     NotNamed {
         /// The root.
         root_version: u64,
-        /// Whose.
+        /// The role that has other keys there.
         role: &'static str,
     },
     /// The folder is not this store's, or not there.

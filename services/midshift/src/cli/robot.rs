@@ -48,7 +48,7 @@ pub enum Verb {
     Cordon {
         #[command(flatten)]
         one: One,
-        /// Why.
+        /// Why it gets no new work.
         #[arg(long)]
         reason: String,
         /// Only if it is still as this etag says.
@@ -97,7 +97,7 @@ pub enum Verb {
     Retire {
         #[command(flatten)]
         one: One,
-        /// Why.
+        /// Why it leaves the fleet.
         #[arg(long)]
         reason: String,
         /// Only if it is still as this etag says.
@@ -154,7 +154,7 @@ pub enum Verb {
     Pin {
         #[command(flatten)]
         one: One,
-        /// Why.
+        /// Why it is kept there, for the audit.
         #[arg(long)]
         reason: String,
         #[command(flatten)]
@@ -222,7 +222,7 @@ pub enum Verb {
         /// Of which roll-out.
         #[arg(long, value_name = "ROLLOUT_ID")]
         from: String,
-        /// Why.
+        /// Why it is left out, for the audit.
         #[arg(long, default_value = "")]
         reason: String,
         #[command(flatten)]

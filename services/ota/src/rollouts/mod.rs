@@ -48,7 +48,7 @@ pub struct Parts {
     pub board: Arc<LiveBoard<Live>>,
     /// The site.
     pub site: Arc<Site>,
-    /// Clocks.
+    /// Where the time of the wall, the link and the site is read.
     pub clock: Arc<dyn Clock>,
     /// Releases and keys.
     pub ota: OtaService,
