@@ -70,7 +70,7 @@ pub enum Effect {
     Placed {
         /// The item that was put down.
         item: String,
-        /// Where.
+        /// The waypoint where it lies now.
         waypoint: WaypointId,
         /// For whom.
         work: Option<Work>,
