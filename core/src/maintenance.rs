@@ -15,7 +15,7 @@ pub const INCIDENT: &str = "rollout.incident";
 pub struct DrainRequest {
     /// Never used again.
     pub drain_id: DrainId,
-    /// Whom.
+    /// The robot that is to be taken out of work.
     pub robot_id: RobotId,
     /// For which roll-out.
     pub rollout_id: RolloutId,

@@ -83,7 +83,7 @@ where
     CommandKey<C>: Viewed<P>,
 {
     let at_unix_ms = tx.now.wall.0;
-    let oldest_ms = privacy::of(C::KEYS).before(tx.now.steady_wall()).map_or(i64::MIN, |before| before.0);
+    let oldest_ms = privacy::retention_of(C::KEYS).before(tx.now.steady_wall()).map_or(i64::MIN, |before| before.0);
     let known = CommandKey::<C>::slot(tx.view).values();
     let past = known.filter(|k| k.row.at_unix_ms < oldest_ms).take(FORGOTTEN_AT_ONCE);
     let past: Vec<String> = past.map(|k| k.row.id.clone()).collect();

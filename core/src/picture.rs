@@ -36,7 +36,7 @@ pub trait Picture: 'static {
 
 /// A record that a picture keeps.
 pub trait Viewed<P: Picture>: Record {
-    /// Where.
+    /// The slot of the picture that keeps it.
     fn slot(picture: &mut P) -> &mut Slot<Self>;
     /// What else changes with it: indices and what must be looked at again. Called after the slot changed.
     fn changed(_picture: &mut P, _id: &str, _old: Option<&Self>) {}

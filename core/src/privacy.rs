@@ -99,9 +99,9 @@ pub const PRECISE_MS: u64 = limits::POSITION_PRECISE_HOURS * HOUR_MS;
 /// Something that outlives the call that it came in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Place {
-    /// Rows.
+    /// Rows of one table of the store.
     Table(Table),
-    /// Entries.
+    /// Entries of one log of the store.
     Log(Log),
     /// STATUS samples as they came, in telemetry.db.
     Samples,
@@ -135,7 +135,7 @@ impl Place {
 /// One place and what it holds.
 #[derive(Clone, Copy, Debug)]
 pub struct Kept {
-    /// Where.
+    /// The place that outlives the call.
     pub place: Place,
     /// What: the first is what the place is there for, the others come with it.
     pub holds: &'static [DataClass],
@@ -241,7 +241,7 @@ kept! {
 }
 
 /// How long rows of a table are kept; [`Retention::Standing`] where the list does not know it.
-pub fn of(table: Table) -> Retention {
+pub fn retention_of(table: Table) -> Retention {
     let found = KEPT.iter().find(|kept| kept.place == Place::Table(table));
     found.map_or(Retention::Standing, |kept| kept.retention)
 }
@@ -289,7 +289,7 @@ mod tests {
     #[test]
     fn who_decided_what_is_kept_as_long_as_the_audit_and_nothing_that_goes_by_age_longer() {
         for table in Table::ALL.iter().filter(|table| table.is_audit()) {
-            assert_eq!(of(*table), Retention::Year, "{}", table.name());
+            assert_eq!(retention_of(*table), Retention::Year, "{}", table.name());
         }
         let longest = KEPT.iter().filter_map(Kept::age_max_ms).max();
         assert_eq!(longest, Some(limits::AUDIT_DAYS * DAY_MS));

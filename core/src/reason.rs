@@ -520,7 +520,7 @@ impl Violations {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{}: {}", reason.name(), reason.text())]
 pub struct Refusal {
-    /// Why.
+    /// Why not, with a code and its facts.
     pub reason: Reason,
     /// For [`Kind::Invalid`]: each broken rule.
     pub violations: Vec<Violation>,

@@ -30,7 +30,7 @@ pub enum Mode {
     Automatic,
     /// A person drives; a live attempt becomes UNCERTAIN.
     Manual,
-    /// Maintenance.
+    /// It is being maintained.
     Service,
 }
 
@@ -70,7 +70,7 @@ pub enum StopLevel {
     /// No stop.
     #[default]
     None,
-    /// Slow.
+    /// Drive slowly.
     Slow,
     /// Stand still, powered.
     Halt,
@@ -81,9 +81,9 @@ pub enum StopLevel {
 /// Where the robot is, in the frame of its site's map (x east, y north, right-handed).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Pose {
-    /// Millimetres.
+    /// Millimetres to the east.
     pub x_mm: i32,
-    /// Millimetres.
+    /// Millimetres to the north.
     pub y_mm: i32,
     /// Thousandths of a radian, -3142..=3142, counter-clockwise from x.
     pub theta_mrad: i32,
@@ -169,7 +169,7 @@ pub enum WorkState {
     Paused,
     /// It is on its way to a stop.
     Stopping,
-    /// Done.
+    /// It has done all steps.
     Succeeded,
     /// Ended by a fault.
     Failed,

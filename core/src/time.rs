@@ -20,7 +20,7 @@ macro_rules! clock_types {
             pub const fn from_secs(secs: u64) -> Self {
                 Self(secs * 1000)
             }
-            /// Milliseconds.
+            /// As a number of milliseconds.
             pub const fn as_ms(self) -> u64 {
                 self.0
             }

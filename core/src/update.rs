@@ -41,7 +41,7 @@ pub struct ActivationGrant {
 /// Section `update` of a robot's desired state: whole, newest wins.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DesiredUpdate {
-    /// Whose.
+    /// The robot that is to have it.
     pub robot_id: RobotId,
     /// max(previous + 1, unix ms).
     pub generation: u64,
@@ -172,7 +172,7 @@ pub enum UpdateEvent {
     DirectiveRefused {
         /// Generation of the section it came in.
         generation: u64,
-        /// Why.
+        /// Why the robot refused it.
         reason: Reason,
     },
     /// It stands, is free of work, and asks for a grant.
@@ -192,7 +192,7 @@ const WORD_LETTERS_MAX: usize = 64;
 /// What a robot says at Hello that it has installed, signed with the key of its machine.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Installed {
-    /// Whose.
+    /// The robot that says it.
     pub robot_id: RobotId,
     /// The start of the agent that says it.
     pub boot_id: String,

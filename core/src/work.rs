@@ -16,7 +16,7 @@ use std::sync::Arc;
 /// Section `work` of a robot's desired state: whole, newest wins.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DesiredWork {
-    /// Whose.
+    /// The robot that is to have it.
     pub robot_id: RobotId,
     /// max(previous + 1, unix ms): rises also across a restore of the store.
     pub generation: u64,
@@ -102,7 +102,7 @@ impl Assignment {
 /// One step as the robot does it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct WorkStep {
-    /// What.
+    /// What is done in it.
     pub kind: StepKind,
     /// What may happen if nobody knows whether it was done.
     pub effect: Effect,
@@ -122,7 +122,7 @@ pub struct WorkStep {
 pub enum StepKind {
     /// Drive to a waypoint.
     Goto {
-        /// Goal.
+        /// The waypoint where the drive ends.
         waypoint: WaypointId,
     },
     /// Do something where it stands.
@@ -132,7 +132,7 @@ pub enum StepKind {
         /// Parameters, a JSON object.
         params: serde_json::Map<String, serde_json::Value>,
     },
-    /// Stand.
+    /// Stand where it is.
     Wait {
         /// Milliseconds of site time.
         duration_ms: u64,
@@ -154,11 +154,11 @@ pub enum Effect {
 /// One waypoint of a route.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RoutePoint {
-    /// Which.
+    /// The waypoint, as the site file names it.
     pub waypoint: WaypointId,
-    /// Millimetres.
+    /// Millimetres to the east, in the site's frame.
     pub x_mm: i32,
-    /// Millimetres.
+    /// Millimetres to the north, in the site's frame.
     pub y_mm: i32,
     /// The goto step that ends here, if one does.
     pub ends_step: Option<u32>,
@@ -175,7 +175,7 @@ pub struct RoutePoint {
 /// Permission to enter one place. Single use: after leaving, another is needed.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GrantedPlace {
-    /// Which.
+    /// The place that may be entered.
     pub place_id: PlaceId,
     /// Never used again.
     pub grant_id: u64,
@@ -186,7 +186,7 @@ pub struct GrantedPlace {
 /// Section `policy`: limits and rules of the areas, whole.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DesiredPolicy {
-    /// Whose.
+    /// The robot that is to have it.
     pub robot_id: RobotId,
     /// max(previous + 1, unix ms).
     pub generation: u64,
@@ -204,13 +204,13 @@ impl Record for DesiredPolicy {
 /// What was driven and spent in one attempt.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WorkStats {
-    /// Millimetres.
+    /// Millimetres driven, with a load and without.
     pub path_mm: u64,
     /// Of these, with a load.
     pub loaded_path_mm: u64,
     /// Milliseconds of site time from acceptance.
     pub duration_ms: u64,
-    /// Milliwatt-hours.
+    /// Milliwatt-hours used, as the robot's body counts them.
     pub energy_mwh: u64,
     /// Tenths of a degree, highest joint temperature seen.
     pub hottest_joint_decidegrees: i32,
@@ -269,7 +269,7 @@ pub enum RobotEvent {
     Attempt(AttemptReport),
     /// A place was entered, left or given back.
     Place {
-        /// Which.
+        /// The place that it is about.
         place_id: PlaceId,
         /// On which grant; 0: none.
         grant_id: u64,
@@ -278,7 +278,7 @@ pub enum RobotEvent {
     },
     /// A fault began or ended.
     Fault {
-        /// Which.
+        /// The fault, with its code and class.
         fault: Fault,
         /// It is over.
         cleared: bool,
@@ -309,7 +309,7 @@ pub enum RobotEvent {
     Update(UpdateEvent),
     /// The state of charge fell below the critical threshold.
     BatteryCritical {
-        /// Permille.
+        /// State of charge, permille.
         battery_permille: u16,
     },
 }
@@ -321,7 +321,7 @@ pub struct Sample {
     pub seq: u64,
     /// Robot's wall clock, unix ms UTC. Shown, never used for order.
     pub robot_unix_ms: i64,
-    /// What.
+    /// What the robot saw or did.
     pub body: SampleBody,
 }
 
@@ -338,13 +338,13 @@ pub enum SampleBody {
 /// A range that will never come, said by the robot: loss is never silent.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Gap {
-    /// Lane.
+    /// The lane whose numbers are missing.
     pub lane: Lane,
     /// First missing number.
     pub from_seq: u64,
     /// Last missing number.
     pub to_seq: u64,
-    /// Why.
+    /// Why they are lost.
     pub reason: Reason,
 }
 
@@ -359,7 +359,7 @@ pub struct InboxEntry {
     pub ring: String,
     /// Its lane: CRITICAL or EVENT.
     pub lane: Lane,
-    /// What.
+    /// The sample or gap that came, or a mark of one that could not be read.
     pub what: InboxItem,
     /// The robot's stamp was ahead of ours by more than the known offset and error. Never rewritten.
     #[serde(default)]
@@ -386,7 +386,7 @@ pub enum InboxItem {
 /// A robot's newest session, written by telemetry at each Hello.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Session {
-    /// Whose.
+    /// The robot whose session it is.
     pub robot_id: RobotId,
     /// max(old + 1, unix ms): sessions with less are fenced.
     pub session_epoch: u64,
@@ -471,7 +471,7 @@ impl Record for Session {
 /// Presence of a robot as telemetry sees it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PresenceRow {
-    /// Whose.
+    /// The robot whose presence it is.
     pub robot_id: RobotId,
     /// Heard or not.
     pub presence: Presence,
@@ -586,7 +586,7 @@ impl Record for LaneMark {
 /// The newest heartbeat of a robot with what the server knows about it: the volatile face, never a row.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Live {
-    /// Whose.
+    /// The robot that sent it.
     pub robot_id: RobotId,
     /// What it said.
     pub report: crate::robot::ReportedState,

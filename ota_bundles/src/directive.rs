@@ -74,7 +74,7 @@ pub enum Rejection {
 
 /// What a robot holds a directive against.
 pub struct Expected<'a> {
-    /// Itself.
+    /// The robot that checks it.
     pub robot_id: &'a RobotId,
     /// Keys whose directives it takes.
     pub keys: &'a BTreeMap<KeyId, PublicKey>,

@@ -34,7 +34,7 @@ impl<T: Read + Seek + Send> Base for T {}
 pub struct Encoded {
     /// Of its bytes.
     pub digest: Digest,
-    /// Bytes.
+    /// How many bytes it has.
     pub length: u64,
 }
 

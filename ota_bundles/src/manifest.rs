@@ -32,7 +32,7 @@ pub enum ComponentKind {
     Process,
     /// Weights of a policy.
     Weights,
-    /// Settings.
+    /// Settings of its programs.
     Config,
     /// The operating system beneath; it has two slots of its own.
     Base,
@@ -54,7 +54,7 @@ impl ComponentKind {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Needs {
-    /// Nothing.
+    /// Nothing has to be started again.
     None,
     /// Start its programs again.
     Restart,
@@ -80,7 +80,7 @@ impl Needs {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Migration {
-    /// Nothing.
+    /// The data stays as it is.
     #[default]
     None,
     /// Something that the version before can undo or ignore. Done on commit, never before.
@@ -93,7 +93,7 @@ pub enum Migration {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SafetyClass {
-    /// None.
+    /// It bears on no safety function.
     #[default]
     None,
     /// It bears on one; refused unless the site allows it.
@@ -194,7 +194,7 @@ pub struct Component {
     pub data_migration: Migration,
     /// SHA-256 of its bytes.
     pub digest: Digest,
-    /// Bytes.
+    /// How many bytes it has.
     pub length: u64,
 }
 

@@ -33,7 +33,7 @@ pub enum Error {
     /// Not a document of this role.
     #[error("reading {role}: {source}")]
     Read {
-        /// Which.
+        /// The role whose document it should be.
         role: &'static str,
         /// Why not.
         source: serde_json::Error,
@@ -41,9 +41,9 @@ pub enum Error {
     /// It breaks a rule of TUF.
     #[error("{role}: {text}")]
     Rule {
-        /// Which.
+        /// The role whose document it is.
         role: &'static str,
-        /// What.
+        /// The rule that it breaks, in words.
         text: String,
     },
 }
@@ -188,7 +188,7 @@ pub struct FileTarget {
     pub name: String,
     /// Of its bytes.
     pub digest: Digest,
-    /// Bytes.
+    /// How many bytes it has.
     pub length: u64,
 }
 

@@ -46,7 +46,7 @@ pub enum Unfit {
     /// For other machines.
     #[error("{component} does not run on model {model:?}")]
     Hardware {
-        /// Which.
+        /// Name of the component.
         component: String,
         /// The robot's.
         model: String,
@@ -54,7 +54,7 @@ pub enum Unfit {
     /// Going back so far would be dangerous.
     #[error("{component} has rollback index {index}; this robot takes none below {floor}")]
     BelowFloor {
-        /// Which.
+        /// Name of the component.
         component: String,
         /// Its own.
         index: u64,
@@ -64,7 +64,7 @@ pub enum Unfit {
     /// Something is not there, or too old.
     #[error("{component} needs {name} {version} or later")]
     Missing {
-        /// Which.
+        /// Name of the component.
         component: String,
         /// What it needs.
         name: String,
@@ -74,7 +74,7 @@ pub enum Unfit {
     /// Something is there that must not be.
     #[error("{component} does not go with {name} {version} or earlier")]
     Conflict {
-        /// Which.
+        /// Name of the component.
         component: String,
         /// What it excludes.
         name: String,
@@ -86,13 +86,13 @@ pub enum Unfit {
         "{component} bears on a safety function, which this site does not allow: validating it is the integrator's duty"
     )]
     SafetyRelated {
-        /// Which.
+        /// Name of the component.
         component: String,
     },
     /// It cannot read the tasks of this midshift.
     #[error("{component} understands task schema {lowest} to {highest}, not {TASK_SCHEMA}")]
     TaskSchema {
-        /// Which.
+        /// Name of the component.
         component: String,
         /// Its first.
         lowest: u32,
@@ -102,7 +102,7 @@ pub enum Unfit {
     /// A robot has one program and one operating system.
     #[error("{first} and {second} are both of kind {}", kind.as_str())]
     Twice {
-        /// Which.
+        /// Name of one component.
         first: String,
         /// And which.
         second: String,

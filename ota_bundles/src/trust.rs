@@ -120,7 +120,7 @@ pub enum Error {
     /// A document is older than one that was believed.
     #[error("{role} {offered} is older than {believed}, which was believed")]
     Older {
-        /// Which.
+        /// The role whose document it is.
         role: &'static str,
         /// Version that was offered.
         offered: u64,
@@ -130,9 +130,9 @@ pub enum Error {
     /// A document is past its time.
     #[error("{role} expired at {expires}; it is {now} at least")]
     Expired {
-        /// Which.
+        /// The role whose document it is.
         role: &'static str,
-        /// When.
+        /// When it expired, UTC.
         expires: String,
         /// The time it was held against.
         now: String,
@@ -175,7 +175,7 @@ pub struct Reading {
 pub struct Listed {
     /// Of its bytes.
     pub digest: Digest,
-    /// Bytes.
+    /// How many bytes it has.
     pub length: u64,
 }
 

@@ -43,7 +43,7 @@ pub enum ToRobot {
 /// Everything the robot believes, before anything else is said.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Hello {
-    /// Who.
+    /// The robot that says it.
     pub robot_id: RobotId,
     /// New for each start of the agent; orders nothing.
     pub boot_id: String,
@@ -137,7 +137,7 @@ pub struct Welcome {
 /// What is durable of one lane.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LaneAck {
-    /// Which.
+    /// The lane that it is about.
     pub lane: Lane,
     /// All up to and with this one are durable.
     pub seq: u64,
@@ -168,7 +168,7 @@ pub struct Heartbeat {
 /// Samples and gaps of one lane, by rising number.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LaneBatch {
-    /// Which.
+    /// The lane that numbers them.
     pub lane: Lane,
     /// What; poison only when read by the server.
     pub items: Vec<InboxItem>,
@@ -177,7 +177,7 @@ pub struct LaneBatch {
 /// A batch of old STATUS beside the session: on the bulk connection, with the proof of the session that it is for.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StatusReplay {
-    /// Who.
+    /// The robot that sends it.
     pub robot_id: RobotId,
     /// The session that this robot has now.
     pub session_epoch: u64,
@@ -239,7 +239,7 @@ pub struct Downlink {
 pub struct StopFacts {
     /// Engaged and not reset.
     pub stops: Vec<Stop>,
-    /// Reset.
+    /// Resets, each of one stop by its id.
     pub resets: Vec<Reset>,
 }
 
@@ -257,7 +257,7 @@ pub struct Echo {
 /// The end of a session.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Close {
-    /// Why.
+    /// Why the session ends, as a code.
     pub code: CloseCode,
     /// Why, for a person.
     pub reason: Reason,

@@ -30,7 +30,7 @@ pub enum Slot {
 }
 
 impl Slot {
-    /// Both.
+    /// Both slots, in the order of their names.
     pub const ALL: [Self; 2] = [Self::A, Self::B];
 
     /// The one beside it.
@@ -70,7 +70,7 @@ pub struct Image {
 /// A slot that is started from and not yet good.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Trying {
-    /// Which.
+    /// The slot that is tried.
     pub slot: Slot,
     /// Starts that it was given since it last ran well.
     pub tries: u32,

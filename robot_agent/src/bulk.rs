@@ -129,7 +129,7 @@ async fn close_when_idle(line: Weak<Mutex<Line>>) {
 /// One use of the connection.
 pub(crate) struct Lease {
     line: Arc<Mutex<Line>>,
-    /// It.
+    /// The connection that is used.
     pub(crate) channel: Channel,
 }
 

@@ -27,7 +27,7 @@ use std::collections::{BTreeSet, VecDeque};
 /// What does not change while the agent runs.
 #[derive(Clone, Debug)]
 pub struct CoreConfig {
-    /// Who.
+    /// The robot that the agent is of.
     pub robot_id: RobotId,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: Bugs,
@@ -347,7 +347,7 @@ impl AgentCore {
         &self.kept
     }
 
-    /// Who.
+    /// The robot that the agent is of.
     pub fn robot_id(&self) -> &RobotId {
         &self.config.robot_id
     }

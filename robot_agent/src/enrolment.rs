@@ -50,9 +50,9 @@ pub enum Error {
     /// The file.
     #[error("{path}: {source}", path = path.display())]
     File {
-        /// Which.
+        /// The file that was read or written.
         path: PathBuf,
-        /// Why.
+        /// What the operating system said.
         source: io::Error,
     },
     /// A file with a secret that others may read.

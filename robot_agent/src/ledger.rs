@@ -53,7 +53,7 @@ pub struct Intent {
 /// The holder: the one attempt that this robot executes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Holder {
-    /// Which.
+    /// The attempt that is executed.
     pub attempt: AttemptId,
     /// Steps done = index of the step at hand.
     pub step: u32,
@@ -104,17 +104,17 @@ pub struct SubjectRow {
 pub struct Ledger {
     /// Newest session.
     pub session: SessionMemory,
-    /// Generations.
+    /// Generations of sections that were applied.
     pub applied: Applied,
     /// Rules of the areas, so that a restart never drives without them.
     pub policy: Vec<AreaPolicy>,
     /// The holder.
     pub holder: Option<Holder>,
-    /// Places.
+    /// Places and grants.
     pub places: PlacesRow,
     /// The drain that holds the robot: never beside `holder`.
     pub maintenance: Option<DrainId>,
-    /// Software.
+    /// What it remembers of its software.
     pub software: SoftwareRow,
     /// What is believed of the repository.
     pub trusted: Option<Arc<Trusted>>,

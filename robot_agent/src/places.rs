@@ -30,7 +30,7 @@ pub enum Entry {
         grant_id: u64,
         /// What it was anchored to.
         authority: Authority,
-        /// Why.
+        /// What makes it stale.
         why: Stale,
     },
     /// No grant.

@@ -45,7 +45,7 @@ use tonic::{Status, Streaming};
 
 /// What one agent is told at its start.
 pub struct AgentConfig {
-    /// Who.
+    /// The robot that the agent is of.
     pub robot_id: RobotId,
     /// New for each start of the process.
     pub boot_id: String,

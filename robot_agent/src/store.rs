@@ -60,7 +60,7 @@ pub enum Op {
     Places(PlacesRow),
     /// The drain that holds the robot.
     Maintenance(Option<DrainId>),
-    /// Software.
+    /// What it remembers of its software.
     Software(Box<SoftwareRow>),
     /// What is believed of the repository.
     Trusted(Arc<Trusted>),
@@ -89,9 +89,9 @@ pub enum Op {
 /// All that a robot remembers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Kept {
-    /// Work.
+    /// What it remembers of its work.
     pub ledger: Ledger,
-    /// Samples.
+    /// Samples that are not yet acknowledged.
     pub ring: Ring,
 }
 

@@ -34,9 +34,9 @@ pub enum Error {
     /// A certificate or a key that cannot be read.
     #[error("reading {what}: {reason}")]
     Unreadable {
-        /// What.
+        /// What was being read.
         what: &'static str,
-        /// Why.
+        /// What speaks against it, in words.
         reason: String,
     },
     /// Certificate and key.

@@ -63,7 +63,7 @@ pub enum Error {
     /// The file.
     #[error("reading {path}: {source}")]
     Io {
-        /// Which.
+        /// The file that was read.
         path: PathBuf,
         /// Why not.
         source: io::Error,
@@ -71,7 +71,7 @@ pub enum Error {
     /// Its content.
     #[error("{path}: {refusal}")]
     Refused {
-        /// Which.
+        /// The file that was read.
         path: PathBuf,
         /// Every broken rule.
         refusal: Box<Refusal>,

@@ -35,7 +35,7 @@ pub struct Effort {
 }
 
 impl Default for Effort {
-    /// Standing.
+    /// The effort of a robot that stands.
     fn default() -> Self {
         Self {
             speed_m_s: 0.0,

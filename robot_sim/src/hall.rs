@@ -26,7 +26,7 @@ pub enum Error {
     /// More robots than seats.
     #[error("site {site} has seats for {found} robots, not for {asked}")]
     TooFewSeats {
-        /// Which.
+        /// Id of the site.
         site: String,
         /// Robots wanted.
         asked: usize,
@@ -38,7 +38,7 @@ pub enum Error {
     Prefix {
         /// As given.
         prefix: String,
-        /// Why.
+        /// Why ids cannot begin so.
         source: midshift_core::ids::Error,
     },
     /// A body could not be made.
@@ -52,7 +52,7 @@ pub enum Error {
 /// Where bodies keep what outlives the process.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Persistence {
-    /// Nowhere.
+    /// Nowhere: it ends with the process.
     Memory,
     /// In `<dir>/<robot_id>/`.
     Dir(PathBuf),
@@ -138,7 +138,7 @@ impl HallConfig {
 /// What a hall reports at the end of a run.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct HallReport {
-    /// Robots.
+    /// How many robots it had.
     pub robots: usize,
     /// What the journals say.
     pub verdict: Verdict,

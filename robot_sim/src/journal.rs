@@ -20,19 +20,19 @@ pub enum Error {
     /// The file could not be opened, read or cut.
     #[error("journal {path}: {source}")]
     File {
-        /// Which.
+        /// The file of the journal.
         path: PathBuf,
-        /// Why.
+        /// What the operating system said.
         source: std::io::Error,
     },
     /// A line in the middle is no entry.
     #[error("journal {path} line {line}: {source}")]
     Line {
-        /// Which.
+        /// The file of the journal.
         path: PathBuf,
         /// From 1.
         line: usize,
-        /// Why.
+        /// What the reader of JSON says.
         source: serde_json::Error,
     },
 }
@@ -54,12 +54,12 @@ pub enum Effect {
     Made {
         /// The item, unique in the world.
         item: String,
-        /// Where.
+        /// The waypoint where it lies.
         waypoint: WaypointId,
     },
     /// The robot took an item up.
     Picked {
-        /// Which.
+        /// The item that was taken up.
         item: String,
         /// Where from.
         waypoint: WaypointId,
@@ -68,16 +68,16 @@ pub enum Effect {
     },
     /// The robot put its item down.
     Placed {
-        /// Which.
+        /// The item that was put down.
         item: String,
-        /// Where.
+        /// The waypoint where it lies now.
         waypoint: WaypointId,
         /// For whom.
         work: Option<Work>,
     },
     /// A person took the item off the robot and carried it back.
     Returned {
-        /// Which.
+        /// The item that was carried back.
         item: String,
         /// Where it was picked.
         waypoint: WaypointId,
@@ -86,24 +86,24 @@ pub enum Effect {
     },
     /// An item left the world because its place was full.
     Shipped {
-        /// Which.
+        /// The item that left the world.
         item: String,
         /// From where.
         waypoint: WaypointId,
     },
     /// The robot's contour reached into a place.
     Entered {
-        /// Which.
+        /// The place that it reached into.
         place_id: PlaceId,
     },
     /// The robot's contour is out of a place.
     Left {
-        /// Which.
+        /// The place that it is out of.
         place_id: PlaceId,
     },
     /// The robot obeys another level of operational stop from now on.
     Obeys {
-        /// Which.
+        /// The level that it obeys from then on.
         level: StopLevel,
         /// Millimetres driven so far.
         odometer_mm: u64,
@@ -134,7 +134,7 @@ pub struct Entry {
     pub site_ms: u64,
     /// Who did it; none: the world itself.
     pub robot_id: Option<RobotId>,
-    /// What.
+    /// What happened in the world.
     #[serde(flatten)]
     pub effect: Effect,
 }

@@ -61,25 +61,25 @@ pub enum Error {
     /// A directory could not be made.
     #[error("making {path}: {source}")]
     Dir {
-        /// Which.
+        /// The directory that was to be made.
         path: PathBuf,
-        /// Why.
+        /// What the operating system said.
         source: std::io::Error,
     },
     /// An agent's ledger could not be kept.
     #[error("agent of {robot_id}: {source}")]
     Store {
-        /// Whose.
+        /// The robot that the agent is of.
         robot_id: RobotId,
-        /// Why.
+        /// What the ledger's store says.
         source: store::Error,
     },
     /// An agent's software could not be kept.
     #[error("software of {robot_id}: {source}")]
     Sets {
-        /// Whose.
+        /// The robot that the agent is of.
         robot_id: RobotId,
-        /// Why.
+        /// What the store of software says.
         source: sets::Error,
     },
 }

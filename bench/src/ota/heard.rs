@@ -33,7 +33,7 @@ pub struct Beat {
     pub at_ms: i64,
     /// Number of the newest STATUS sample on the robot, made with this heartbeat if it rose.
     status_seq: u64,
-    /// Permille.
+    /// State of charge, permille.
     battery: u32,
     /// Tenths of a degree Celsius.
     joint: i32,
@@ -103,7 +103,7 @@ async fn watch(channel: Channel, robot_id: String, beats: Arc<Mutex<Vec<Beat>>>)
 }
 
 impl Watcher {
-    /// Begins.
+    /// Watches a robot from now on.
     pub fn begin(channel: Channel, robot_id: &str) -> Self {
         let beats: Arc<Mutex<Vec<Beat>>> = Arc::default();
         let watch = AbortOnDropHandle::new(tokio::spawn(watch(channel, robot_id.to_owned(), beats.clone())));

@@ -166,7 +166,7 @@ impl Note {
 /// On whose behalf a row is written.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct By {
-    /// Who.
+    /// The actor as it is named in rows: a person, a program, a robot or a service.
     pub actor: Arc<str>,
     /// The token that was shown; none: none was.
     pub token: Option<TokenId>,
@@ -197,7 +197,7 @@ pub fn refusal(
 pub struct Draft {
     /// Whose chain.
     pub writer: Writer,
-    /// What.
+    /// What was done, about which things, and why.
     pub note: Box<Note>,
     /// On whose behalf.
     pub by: By,
@@ -240,7 +240,7 @@ pub struct AuditRow {
     pub n: u64,
     /// UTC of the wall when committed, unix ms.
     pub at_unix_ms: i64,
-    /// Who.
+    /// The actor that the action is counted for, by name.
     pub actor: String,
     /// Which token was shown; empty: none was, or an older release wrote the row.
     #[serde(default, skip_serializing_if = "String::is_empty")]

@@ -15,7 +15,7 @@ pub enum Broken {
     /// A row is not as it was written.
     #[error("row {n} was altered")]
     Altered {
-        /// Which.
+        /// Number of the altered row in its chain, from 1.
         n: u64,
     },
     /// A row does not follow the one before it, each whole by itself.
@@ -61,7 +61,7 @@ pub enum Broken {
     /// A row holds together and is not the one that was there.
     #[error("row {n} is not the one that {by} has: it was written anew")]
     Rewritten {
-        /// Which.
+        /// Number of the row in its chain, from 1.
         n: u64,
         /// Who has another.
         by: String,
@@ -96,7 +96,7 @@ impl Broken {
 pub struct Verified {
     /// Its first row; above 1: older ones were cut. 0: it has none.
     pub first: u64,
-    /// Rows.
+    /// How many rows of it were verified.
     pub rows: u64,
     /// Its newest row.
     pub head: Head,

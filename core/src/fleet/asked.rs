@@ -13,28 +13,28 @@ use std::collections::{BTreeMap, BTreeSet};
 pub enum Command {
     /// No new work; what it does now, it finishes.
     Cordon {
-        /// Whom.
+        /// The robot that gets no new work.
         robot_id: RobotId,
-        /// Why.
+        /// Why, in a person's words.
         reason: String,
     },
     /// Back to work; also resets the breaker.
     Uncordon {
-        /// Whom.
+        /// The robot that works again.
         robot_id: RobotId,
     },
     /// Out of the fleet: no work, and no roll-out or drain waits for it. Uncordon brings it back.
     Retire {
-        /// Whom.
+        /// The robot that leaves the fleet.
         robot_id: RobotId,
-        /// Why.
+        /// Why, in a person's words.
         reason: String,
     },
     /// Ignores an attempt that the robot lists and no row knows. Frees no place and no load.
     Disown {
-        /// Whose.
+        /// The robot that lists the attempt.
         robot_id: RobotId,
-        /// Which.
+        /// The attempt that is ignored from then on.
         attempt: AttemptId,
         /// What the person saw.
         reason: String,
@@ -57,7 +57,7 @@ pub enum Command {
     },
     /// Out of work for maintenance: what it does ends or waits, then it parks.
     Drain {
-        /// Whom.
+        /// The robot that is taken out of work.
         robot_id: RobotId,
         /// What for.
         reason: String,
@@ -66,21 +66,21 @@ pub enum Command {
     },
     /// Ends the drains that people asked for.
     Undrain {
-        /// Whom.
+        /// The robot whose drains end.
         robot_id: RobotId,
     },
     /// New rules of an area, pushed to every robot.
     PutPolicy(AreaPolicy),
     /// A person has looked: nobody and nothing is inside.
     ClearPlace {
-        /// Which.
+        /// The place that is empty.
         place_id: PlaceId,
         /// What the person saw.
         reason: String,
     },
     /// A person has looked into it.
     CloseIncident {
-        /// Which.
+        /// The incident that is closed.
         incident_id: String,
         /// What was found.
         reason: String,

@@ -34,7 +34,7 @@ pub(super) fn trip(tx: &mut Tx, robot_id: &RobotId) {
 
 /// Counts an attempt that the robot is about to let go, if that is its own will. The task still stands as it did before
 /// the report.
-pub(super) fn let_go(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
+pub(super) fn count_let_go(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
     let id = &report.attempt;
     if !matches!(report.state, WorkState::Aborted | WorkState::Suspended | WorkState::Refused)
         || tx.view.held_by(robot_id) != Some(id)

@@ -25,7 +25,7 @@ const COMMAND: &str = "command";
 /// What is closed of one place.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Closure {
-    /// Which.
+    /// The place with something closed.
     pub place_id: PlaceId,
     /// In words, with the robots and the command that opens it.
     pub reason: Reason,
@@ -39,7 +39,7 @@ pub fn is_whole(place: &Place, holder: &PlaceHolder) -> bool {
 }
 
 /// What is closed of the place; none: nothing.
-pub fn of(view: &View, place: &Place) -> Option<Closure> {
+pub fn find_closure(view: &View, place: &Place) -> Option<Closure> {
     let of_holder = |h: &PlaceHolder| lost(view, &h.robot_id).map(|a| (h.robot_id.to_string(), a.ended));
     let mut robots: BTreeMap<String, Option<Utc>> = place.holders.iter().filter_map(of_holder).collect();
     let quarantine = place.quarantine.as_ref();
@@ -53,7 +53,7 @@ pub fn of(view: &View, place: &Place) -> Option<Closure> {
     let since = robots.values().flatten().min().copied();
     let named: Vec<&str> = robots.keys().take(limits::CROWD_NAMED_MAX).map(String::as_str).collect();
     let command = format!("midshift zone clear {} --reason TEXT --if-match ETAG", place.place_id);
-    let told = told(place, &named, since, &command);
+    let told = describe_closure(place, &named, since, &command);
     let reason = Reason::new(Code::PlaceQuarantined, told).with(PLACE_ID, &place.place_id).with("seats", seats);
     let reason = reason.with("robots", named.join(" ")).with(COMMAND, command);
     let reason = since.into_iter().fold(reason, |reason, at| reason.with("since", at.rfc3339()));
@@ -62,7 +62,7 @@ pub fn of(view: &View, place: &Place) -> Option<Closure> {
     Some(Closure { place_id: place.place_id.clone(), reason, since })
 }
 
-fn told(place: &Place, named: &[&str], since: Option<Utc>, command: &str) -> String {
+fn describe_closure(place: &Place, named: &[&str], since: Option<Utc>, command: &str) -> String {
     let (place_id, who) = (&place.place_id, named.join(", "));
     let since = since.map_or_else(String::new, |at| format!(" since {}", at.rfc3339()));
     let what = match place.quarantine {
@@ -85,7 +85,7 @@ fn lost<'v>(view: &'v View, robot_id: &RobotId) -> Option<&'v Attempt> {
 
 impl Closure {
     /// `reason` in the words of this closure, with its facts.
-    pub fn tell(&self, mut reason: Reason) -> Reason {
+    pub fn word_reason(&self, mut reason: Reason) -> Reason {
         reason.message.clone_from(&self.reason.message);
         reason.metadata.extend(self.reason.metadata.clone());
         let command = self.reason.metadata.get(COMMAND).map_or("", String::as_str);
@@ -117,15 +117,15 @@ pub fn name_closed(view: &View, reason: Reason) -> Reason {
     // A stop may bar the way as well: then nobody says which of them does.
     let is_alone = || stopped::closed(view).is_empty();
     let on_the_way = || view.places.values().map(|place| &place.row).find(is_shut).filter(|_| is_alone());
-    match goal.or_else(on_the_way).and_then(|place| of(view, place)) {
-        Some(closure) => closure.tell(reason),
+    match goal.or_else(on_the_way).and_then(|place| find_closure(view, place)) {
+        Some(closure) => closure.word_reason(reason),
         None => reason,
     }
 }
 
 /// Opens an incident of each place that is closed, and closes those of places that are open.
 pub(super) fn tell_closed(view: &mut View, now: Now, plan: &mut Plan) {
-    let closed = view.places.values().filter_map(|place| of(view, &place.row));
+    let closed = view.places.values().filter_map(|place| find_closure(view, &place.row));
     let closed: BTreeMap<String, Closure> = closed.map(|closure| (closure.place_id.to_string(), closure)).collect();
     let told = view.incidents.values().map(|i| &i.row).filter(|i| i.reason.code == Code::PlaceQuarantined);
     let told: Vec<Incident> = told.cloned().collect();

@@ -16,7 +16,7 @@ const CANDIDATES_MAX: usize = 64;
 /// Why one robot is or is not the one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RobotCandidate {
-    /// Who.
+    /// The robot that was considered.
     pub robot_id: RobotId,
     /// Why not. None: eligible.
     pub reason: Option<Reason>,
@@ -141,7 +141,7 @@ fn waits_for_turn(view: &View, task_id: &TaskId, now: &Now, code: Code) -> Reaso
 /// Why one task does not go to the robot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TaskCandidate {
-    /// Which.
+    /// The task that was considered.
     pub task_id: TaskId,
     /// Why not. None: eligible.
     pub reason: Option<Reason>,

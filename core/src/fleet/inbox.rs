@@ -22,7 +22,7 @@ pub fn take(tx: &mut Tx, entry: &InboxEntry, board: &Board, tally: &mut Tally) {
     let robot_id = &entry.robot_id;
     match event {
         RobotEvent::Attempt(report) => {
-            breaker::let_go(tx, robot_id, report);
+            breaker::count_let_go(tx, robot_id, report);
             if calls_offer_over(tx.view, robot_id, report) {
                 answers::refused(tx, robot_id, report);
             }

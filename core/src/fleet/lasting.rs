@@ -23,7 +23,7 @@ pub type Lasting = BTreeMap<(RobotId, Code), LinkTime>;
 const CODES: [Code; 4] = [Code::RobotStopped, Code::RobotManual, Code::RobotFault, Code::RobotBreakerOpened];
 
 /// What a robot says of itself that only a person at the robot ends.
-fn said(report: &ReportedState) -> Vec<Reason> {
+fn list_own_reasons(report: &ReportedState) -> Vec<Reason> {
     let stop = (report.hardware_stop != HardwareStop::None).then(|| standing::stopped_by_itself(report.hardware_stop));
     let manual = (report.mode != Mode::Automatic).then(|| Reason::from(Code::RobotManual));
     let fault = report.fault.as_ref().filter(|fault| fault.class != FaultClass::Recoverable);
@@ -61,7 +61,7 @@ pub(super) fn tell_lasting(view: &mut View, board: &Board, now: Now, plan: &mut 
         // Of what a robot says of itself nobody knows, while it is not heard, that it goes on, nor that it is over.
         let is_heard = heard::presence(board, robot_id, &now) == Presence::Online;
         let is_known = |code: Code| is_heard || code == Code::RobotBreakerOpened;
-        let said = live.map(|live| said(&live.report)).unwrap_or_default();
+        let said = live.map(|live| list_own_reasons(&live.report)).unwrap_or_default();
         for reason in said.into_iter().chain(breaker(view, robot_id)) {
             let key = (robot_id.clone(), reason.code);
             let since = before.remove(&key).filter(|_| !open.contains(&key)).unwrap_or(now.link);

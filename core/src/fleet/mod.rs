@@ -100,7 +100,7 @@ pub struct Report {
     pub more: bool,
     /// Waiting tasks by reason.
     pub waiting: BTreeMap<Code, u64>,
-    /// Counts.
+    /// What was counted while rows were compared and events taken.
     pub tally: Tally,
     /// Robots and tasks that stand for long without a reason, once each; logged.
     pub unexplained: Vec<String>,
@@ -155,7 +155,7 @@ impl Plan {
         let outline = tx.outline();
         let view = tx.take_back();
         if !is_aside {
-            refused::note(view, outline);
+            refused::note_refusal(view, outline);
         }
         false
     }

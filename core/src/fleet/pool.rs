@@ -13,7 +13,7 @@ use std::collections::BTreeSet;
 
 /// A robot that a task may go to.
 pub struct Candidate {
-    /// Who.
+    /// The robot that a task may go to.
     pub robot_id: RobotId,
     /// Where it stands.
     pub at: WaypointIx,

@@ -84,7 +84,7 @@ impl Refused {
 }
 
 /// Notes that the store refused a decision for good, or would; the second time puts it aside.
-pub fn note(view: &mut View, outline: Outline) {
+pub fn note_refusal(view: &mut View, outline: Outline) {
     let robots = robots_of(view, &outline);
     let all = &mut view.refused.known;
     if all.len() >= limits::REFUSED_REMEMBERED && !all.contains_key(&outline) {
@@ -101,7 +101,7 @@ pub fn note(view: &mut View, outline: Outline) {
 /// The store refused a decision for good: it is noted, and what it was about is looked at again.
 pub fn undone(view: &mut View, outline: Outline) {
     view.refused.again.extend(robots_of(view, &outline));
-    note(view, outline);
+    note_refusal(view, outline);
 }
 
 /// Looks again at robots of decisions that were undone, or are not aside any more.
@@ -201,7 +201,7 @@ mod tests {
     fn what_robots_can_make_it_forget_is_bounded() {
         let mut view = view();
         for n in 0..2 * limits::REFUSED_REMEMBERED {
-            note(&mut view, Outline { kind: "tests", keys: vec![Key::new(Table::Incident, n.to_string())] });
+            note_refusal(&mut view, Outline { kind: "tests", keys: vec![Key::new(Table::Incident, n.to_string())] });
         }
         assert_eq!(view.refused.known.len(), limits::REFUSED_REMEMBERED);
     }

@@ -25,7 +25,7 @@ pub enum HolderState {
 /// One robot in or before a place.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PlaceHolder {
-    /// Who.
+    /// The robot that was let in or stands there.
     pub robot_id: RobotId,
     /// Unique per robot; 0: it stood there without a grant.
     pub grant_id: u64,
@@ -41,7 +41,7 @@ pub struct PlaceHolder {
 /// A passage or a standing place: the one row that is fought over.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Place {
-    /// Which.
+    /// The place's id in the site.
     pub place_id: PlaceId,
     /// Robots admitted at once.
     pub capacity: u32,
@@ -74,7 +74,7 @@ impl Record for Place {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RobotHolder {
-    /// Nothing.
+    /// Nobody has the robot.
     #[default]
     None,
     /// An attempt of a task or errand.
@@ -86,7 +86,7 @@ pub enum RobotHolder {
 /// The robot's mutex: an assignment and a drain are both an update of this one row.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RobotAuthority {
-    /// Whose.
+    /// The robot that it is the mutex of.
     pub robot_id: RobotId,
     /// Who has it.
     pub holder: RobotHolder,
@@ -102,9 +102,9 @@ impl Record for RobotAuthority {
 /// Out of dispatch because a person said so.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Cordon {
-    /// Why.
+    /// Why, in a person's words.
     pub reason: String,
-    /// Who.
+    /// The actor that said so, by name.
     pub actor: String,
     /// UTC, site clock.
     pub since: Utc,
@@ -131,7 +131,7 @@ pub struct LoadSettled {
 /// What people and the breaker decided about a robot.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RobotControl {
-    /// Whose.
+    /// The robot that it was decided about.
     pub robot_id: RobotId,
     /// Out of dispatch by a person.
     pub cordon: Option<Cordon>,
@@ -281,7 +281,7 @@ impl Record for Timer {
 /// Why a robot must not move. Tokens of tasks live in the task's own hold set.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct HoldToken {
-    /// Whose.
+    /// The robot that must not move.
     pub robot_id: RobotId,
     /// `stop:body:<robot>` while the body's own safety system stops it, `stop:<stop_id>` while a fleet stop does; `resume:` and the same until a person
     /// resumes.
@@ -310,7 +310,7 @@ impl Record for HoldToken {
 /// Work done by one robot on one version of its software.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RobotCounter {
-    /// Whose.
+    /// The robot that did the work.
     pub robot_id: RobotId,
     /// Version of base software; empty: not reported.
     pub software: String,
@@ -343,7 +343,7 @@ impl Record for RobotCounter {
 /// The site this store serves.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SiteRow {
-    /// Which.
+    /// The site, as its file names it.
     pub site_id: SiteId,
     /// Map version, as its file says.
     pub map_version: String,
@@ -393,7 +393,7 @@ impl Record for FleetMark {
 pub struct Incident {
     /// Unique: code, subject and opening time.
     pub id: String,
-    /// What.
+    /// What is wrong, with its facts.
     pub reason: Reason,
     /// About which robot.
     pub robot_id: Option<RobotId>,
@@ -411,7 +411,7 @@ pub struct Incident {
 /// A person has looked into an incident.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Closed {
-    /// Who.
+    /// The actor that looked, by name.
     pub actor: String,
     /// What was found.
     pub reason: String,
@@ -449,7 +449,7 @@ pub enum DrainState {
 pub struct Drain {
     /// Never used again.
     pub drain_id: DrainId,
-    /// Whom.
+    /// The robot that is taken out of work.
     pub robot_id: RobotId,
     /// How far.
     pub state: DrainState,

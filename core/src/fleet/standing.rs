@@ -88,7 +88,7 @@ pub fn of_attempt(view: &View, board: &Board, now: &Now, a: &Attempt) -> Option<
     if let Some(why) = unknown(a, live) {
         return Some(why);
     }
-    if let Err(why) = kept(view, board, now, robot_id) {
+    if let Err(why) = check_goes_on(view, board, now, robot_id) {
         return Some(about_robot(why, robot_id));
     }
     if let Some(why) = place_wait(view, robot_id) {
@@ -100,7 +100,7 @@ pub fn of_attempt(view: &View, board: &Board, now: &Now, a: &Attempt) -> Option<
     match (a.phase, listed) {
         (AttemptPhase::Offered, _) => Some(Reason::from(Code::WaitingForAnswer).with(WAITS_FOR, robot)),
         (AttemptPhase::Stopping, _) => Some(Reason::from(Code::WaitingForStop).with(WAITS_FOR, robot)),
-        (phase, _) if phase.is_terminal() => Some(let_go(view, a).with(WAITS_FOR, robot)),
+        (phase, _) if phase.is_terminal() => Some(explain_let_go(view, a).with(WAITS_FOR, robot)),
         // The heartbeat is older than what the robot said since as events, of which the row knows.
         (_, None) if !heard::is_fresh(view, live) => Some(works(view, now, a, live, a.step_index)),
         (_, None) => Some(Reason::from(Code::RobotReconciling).with(WAITS_FOR, robot)),
@@ -111,7 +111,7 @@ pub fn of_attempt(view: &View, board: &Board, now: &Now, a: &Attempt) -> Option<
 }
 
 /// Why the record has let an attempt go that its robot may still have.
-fn let_go(view: &View, a: &Attempt) -> Reason {
+fn explain_let_go(view: &View, a: &Attempt) -> Reason {
     let task = a.attempt.subject.task_id().and_then(|id| view.task(id));
     let newest = task.filter(|task| task.attempt_id().as_ref() == Some(&a.attempt));
     newest.and_then(|task| task.reason.clone()).unwrap_or_else(|| Code::Forced.into())
@@ -162,7 +162,7 @@ fn unknown(a: &Attempt, live: Option<&std::sync::Arc<Live>>) -> Option<Reason> {
 }
 
 /// What keeps a robot that has work from going on, apart from places.
-fn kept(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Result<(), Reason> {
+fn check_goes_on(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Result<(), Reason> {
     match heard::presence(board, robot_id, now) {
         Presence::Online => {}
         Presence::Suspect => return Err(Code::RobotSuspect.into()),
@@ -284,8 +284,8 @@ pub fn place_wait(view: &View, robot_id: &RobotId) -> Option<Reason> {
             let places = wait.places.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
             reason = reason.with(WAITS_FOR, format!("{places}: {} {}", key.replace('_', " "), names.join(", ")));
             if key == SHUT {
-                let closure = names.iter().find_map(|id| closures::of(view, &view.places.get(*id)?.row));
-                reason = closure.into_iter().fold(reason, |reason, closure| closure.tell(reason));
+                let closure = names.iter().find_map(|id| closures::find_closure(view, &view.places.get(*id)?.row));
+                reason = closure.into_iter().fold(reason, |reason, closure| closure.word_reason(reason));
             }
         }
         reason = reason.with(key, names.join(" "));
@@ -314,7 +314,7 @@ fn in_the_way(
         let known = view.site.find_place(&p.place_id);
         known.is_some_and(|ix| starts::taken(view, ix, p, robot_id) < p.capacity as usize)
     };
-    let misses_a_seat = |p: &Place| !has_seat(p) && closures::of(view, p).is_some();
+    let misses_a_seat = |p: &Place| !has_seat(p) && closures::find_closure(view, p).is_some();
     let is_shut = |p: &&Place| p.quarantine.is_some() || view.refused.is_place_aside(&p.place_id) || misses_a_seat(p);
     let holders = |seat: bool| -> BTreeSet<String> {
         names(&mut rows().filter(|p| has_seat(p) == seat).flat_map(|p| &p.holders).map(|h| &h.robot_id))

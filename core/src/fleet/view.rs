@@ -74,7 +74,7 @@ pub struct View {
     pub let_go: BTreeMap<TaskId, Seq>,
     /// Attempts that are live or still hold a robot, and the last one of each task that has not ended.
     pub attempts: Slot<Attempt>,
-    /// Deadlines.
+    /// Deadlines that are rows.
     pub timers: Slot<Timer>,
     /// Hold tokens of robots.
     pub holds: Slot<HoldToken>,

@@ -18,7 +18,7 @@ pub struct Effort {
     pub duration_ms: u64,
     /// Millimetres driven.
     pub path_mm: u64,
-    /// Milliwatt-hours.
+    /// Milliwatt-hours used, as robots report them of their tasks.
     pub energy_mwh: u64,
     /// Tenths of a degree, highest joint temperature ever seen. 0: nothing measured.
     pub hottest_joint_decidegrees: i32,

@@ -28,9 +28,9 @@ const ABORT: i64 = ln_micronats(ABORT_EVIDENCE as u128, 1, Rounding::Nearest);
 /// Tasks that ended on a robot or on several. What a person canceled counts nowhere.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct TaskTally {
-    /// Done.
+    /// Tasks that succeeded.
     pub succeeded: u64,
-    /// Failed.
+    /// Tasks that failed.
     pub failed: u64,
 }
 

@@ -116,7 +116,7 @@ impl Role {
 /// Where a grant holds.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Scope {
-    /// Everywhere.
+    /// The whole site, with every area in it.
     Site,
     /// In one area.
     Area(AreaId),
@@ -138,7 +138,7 @@ impl Scope {
 pub struct Grant {
     /// The role.
     pub role: Role,
-    /// Where.
+    /// The site, or the one area that it holds in.
     pub scope: Scope,
 }
 

@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 pub enum Revocation {
     /// A token was revoked, or rotated and ends at a moment to come.
     Token {
-        /// Which.
+        /// The token that is worth nothing from then on.
         token_id: TokenId,
         /// Who did it, and from when on.
         revoked: Act,

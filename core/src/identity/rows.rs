@@ -27,7 +27,7 @@ impl Act {
 /// A token of a person or a program: what is kept of it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TokenRecord {
-    /// Which.
+    /// Its id, by which it is listed and revoked.
     pub token_id: TokenId,
     /// Who it stands for, as an actor. Of those that stand no two have one name, but for one that was rotated and its
     /// successor, and those of an old store.

@@ -1,11 +1,12 @@
-//! What people ask of roll-outs: write one down, check it, stand for it, begin, stand still, go on, judge, end, take back; and of robots: pin,
-//! leave out, lift a quarantine, go back once more.
+//! Carries out what people ask of roll-outs: write one down, check it, stand for it, begin, stand still, go on, judge, end, take back; and of
+//! robots: pin, leave out, lift a quarantine, go back once more.
 //!
 //! Invariant: a command is checked against the whole picture before anything of it is written; asked twice it does the same once.
 
-use super::dry_run::{bundle, dry_run, meets_floor};
-use super::matching::{self, Members, keeps};
+use super::dry_run::{bundle, dry_run, meets_floor, members_to_start, overlapping};
+use super::matching::keeps;
 use super::noted::{note, note_of_verb};
+use super::requests::{Ask, CheckOnly, Command, Taken, Verb};
 use super::rows::{
     Act, Bundle, Counted, Outcome, Pause, Phase, Quarantine, RobotSoftware, Rollout, RolloutRobot, Step, Verdict,
     WayBack,
@@ -15,163 +16,15 @@ use super::view::View;
 use super::{Board, Plan, Tx, assign, effort, hear, moves, objects, phases, refusals, robots, verdict};
 use crate::audit::{self, Note};
 use crate::gates::{Efforts, FailureEvidence};
-use crate::identity::{Actor, Caller};
-use crate::ids::{BundleId, RobotId, RolloutId};
+use crate::identity::Actor;
+use crate::ids::{RobotId, RolloutId};
 use crate::limits;
 use crate::once;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
-use crate::rows::{Revision, Table, Writer};
-use crate::time::{Now, Utc};
-use serde::{Deserialize, Serialize};
+use crate::rows::{Revision, Writer};
+use crate::time::Now;
 use std::collections::BTreeSet;
 use std::sync::Arc;
-
-/// One request about a roll-out.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Verb {
-    /// Check it, and go on to VALIDATED.
-    Submit,
-    /// Stand for it.
-    Approve,
-    /// Begin.
-    Start {
-        /// Roll-outs that have some of the robots are aborted first.
-        supersede: bool,
-    },
-    /// Stand still: no new drain, no new permission.
-    Pause,
-    /// Go on.
-    Resume,
-    /// Go on though the gate did not say so.
-    Promote,
-    /// End it; robots go back.
-    Abort,
-    /// Once more with the robots that failed or were skipped; their quarantine is lifted.
-    RetryFailed,
-    /// Leave a robot out.
-    Exclude(RobotId),
-    /// A robot that is lost counts in no budget until it is heard.
-    Lost(RobotId),
-}
-
-/// One request.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Command {
-    /// Write a roll-out down.
-    Create {
-        /// Its id.
-        rollout_id: RolloutId,
-        /// What it is asked to be.
-        spec: Arc<RolloutSpec>,
-    },
-    /// Take a completed roll-out back with another.
-    Rollback {
-        /// Which.
-        of: RolloutId,
-        /// Id of the other.
-        rollout_id: RolloutId,
-    },
-    /// Something about one.
-    Do {
-        /// Which.
-        rollout_id: RolloutId,
-        /// What.
-        verb: Verb,
-        /// Why; may be empty.
-        reason: String,
-    },
-    /// Take a bundle back: nobody gets it any more.
-    Revoke {
-        /// Which.
-        bundle: BundleId,
-        /// Why.
-        reason: String,
-    },
-    /// Keep a robot at what it runs.
-    Pin {
-        /// Whom.
-        robot_id: RobotId,
-        /// Why.
-        reason: String,
-    },
-    /// Let it take part again.
-    Unpin {
-        /// Whom.
-        robot_id: RobotId,
-    },
-    /// A person mended what kept the robot from going back: it is told to go back once more.
-    Unstick {
-        /// The robot that is told.
-        robot_id: RobotId,
-        /// What was done.
-        reason: String,
-    },
-    /// The machine that shows this device key is the robot's.
-    AcceptKey {
-        /// The robot whose key it is.
-        robot_id: RobotId,
-        /// The key, 64 lower-case hexadecimal digits.
-        device_key: String,
-    },
-    /// A person has looked: the robot may have the bundle again.
-    LiftQuarantine {
-        /// Whom.
-        robot_id: RobotId,
-        /// Which.
-        bundle: BundleId,
-    },
-}
-
-impl Command {
-    /// The roll-outs that it names: whoever decides on it must have them.
-    pub fn rollouts(&self) -> Vec<&RolloutId> {
-        match self {
-            Self::Create { rollout_id, .. } | Self::Do { rollout_id, .. } => vec![rollout_id],
-            Self::Rollback { of, rollout_id } => vec![of, rollout_id],
-            Self::Revoke { .. } | Self::Pin { .. } | Self::Unpin { .. } => Vec::new(),
-            Self::Unstick { .. } | Self::AcceptKey { .. } | Self::LiftQuarantine { .. } => Vec::new(),
-        }
-    }
-}
-
-impl once::Asked for Command {
-    const KEYS: Table = Table::OtaCommandKey;
-}
-
-/// A command as somebody asks for it.
-#[derive(Clone, Debug)]
-pub struct Ask {
-    /// What.
-    pub command: Command,
-    /// Only if the roll-out is still as this says.
-    pub seen: Option<Revision>,
-    /// To be checked and not carried out.
-    pub check_only: CheckOnly,
-    /// The same id with the same command is one request. A [`Verb::Start`] and a [`Verb::RetryFailed`] take none: they are more than one item.
-    pub request_id: Option<String>,
-    /// Who asks.
-    pub by: Caller,
-}
-
-/// Whether a command is only checked.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum CheckOnly {
-    /// Nothing is written.
-    Yes,
-    /// It is carried out.
-    No,
-}
-
-/// What became of a request that nothing is against.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Taken {
-    /// It is carried out, or may be if it was only to be checked. It may be that it changes nothing.
-    Now,
-    /// It was carried out then under its request_id, UTC of the wall. Nothing is done now, nor would be.
-    Before(Utc),
-}
 
 /// Decides on a request whole: what was carried out before, under its request_id or by what is known, is not carried out again. What is refused may leave
 /// an item too, for the audit alone.
@@ -379,7 +232,7 @@ fn is_to_retry(r: &RolloutRobot) -> bool {
 }
 
 fn may_start(view: &View, board: &Board, rollout: &Rollout, supersede: bool) -> Result<(), Refusal> {
-    let (robots, _) = members(view, board, rollout)?;
+    let (robots, _) = members_to_start(view, board, rollout)?;
     let others = overlapping(view, rollout, robots.iter().map(|(id, ..)| id));
     match others.iter().next() {
         Some(other) if !supersede => {
@@ -387,31 +240,6 @@ fn may_start(view: &View, board: &Board, rollout: &Rollout, supersede: bool) -> 
         }
         _ => Ok(()),
     }
-}
-
-/// Roll-outs that would end if this one began in their place.
-pub(super) fn superseded(view: &View, board: &Board, rollout_id: &RolloutId) -> BTreeSet<RolloutId> {
-    let known = view.rollout(rollout_id).and_then(|rollout| Some((rollout, members(view, board, rollout).ok()?)));
-    known.map(|(rollout, (robots, _))| overlapping(view, rollout, robots.iter().map(|(id, ..)| id))).unwrap_or_default()
-}
-
-fn members(view: &View, board: &Board, rollout: &Rollout) -> Result<Members, Refusal> {
-    match &rollout.revert_of {
-        Some(of) => {
-            view.rollout(of).ok_or_else(|| not_found(Code::RolloutNotFound, "rollout_id", of))?;
-        }
-        None => {
-            dry_run(view, board, &rollout.rollout_id, &rollout.spec)?;
-        }
-    }
-    Ok(matching::members(view, board, rollout))
-}
-
-/// Roll-outs that run and have one of these robots.
-fn overlapping<'a>(view: &View, rollout: &Rollout, robots: impl Iterator<Item = &'a RobotId>) -> BTreeSet<RolloutId> {
-    let ids = robots.filter_map(|robot| view.of_robot.get(robot)).flatten().filter(|id| **id != rollout.rollout_id);
-    let open = ids.filter(|id| view.rollout(id).is_some_and(|r| !r.phase.is_over()));
-    open.cloned().collect()
 }
 
 /// Carries out a command that passed its check: one item for most, many for a start.
@@ -569,7 +397,7 @@ fn verb_one(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor: &Act
 
 fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bool, actor: &Actor, plan: &mut Plan) {
     let Some(rollout) = view.rollout(id).cloned() else { return };
-    let Ok((robots, sizes)) = members(view, board, &rollout) else { return };
+    let Ok((robots, sizes)) = members_to_start(view, board, &rollout) else { return };
     let others = overlapping(view, &rollout, robots.iter().map(|(id, ..)| id));
     let control = verdict::controls_of(view, &rollout);
     let effort = effort::of_controls(view, &rollout);

@@ -3,8 +3,8 @@
 //! Called by whoever asks and by the commands that begin one, which therefore never differ.
 
 use super::Board;
-use super::matching::{self, Matched, Matching};
-use super::rows::Bundle;
+use super::matching::{self, Matched, Matching, Members};
+use super::rows::{Bundle, Rollout};
 use super::spec::{RolloutSpec, Wave};
 use super::verdict::{self, ActsOnRates};
 use super::view::View;
@@ -198,4 +198,40 @@ fn lacks(installed: &Installed, name: &str, version: &str) -> bool {
     let there = set.and_then(|set| set.components.get(name));
     let listed = set.is_none_or(|set| set.components_left_out == 0);
     there.map_or(listed, |there| parse_version(there) < parse_version(version))
+}
+
+/// Roll-outs that would end if this one began in their place.
+pub(super) fn superseded(view: &View, board: &Board, rollout_id: &RolloutId) -> BTreeSet<RolloutId> {
+    let known =
+        view.rollout(rollout_id).and_then(|rollout| Some((rollout, members_to_start(view, board, rollout).ok()?)));
+    known.map(|(rollout, (robots, _))| overlapping(view, rollout, robots.iter().map(|(id, ..)| id))).unwrap_or_default()
+}
+
+/// Robots that a roll-out would have, if nothing speaks against it now.
+///
+/// # Errors
+/// Its dry run is refused, or the roll-out that it takes back is not there.
+pub(super) fn members_to_start(view: &View, board: &Board, rollout: &Rollout) -> Result<Members, Refusal> {
+    match &rollout.revert_of {
+        Some(of) => {
+            view.rollout(of).ok_or_else(|| {
+                Refusal::new(Kind::NotFound, Reason::from(Code::RolloutNotFound).with("rollout_id", of))
+            })?;
+        }
+        None => {
+            dry_run(view, board, &rollout.rollout_id, &rollout.spec)?;
+        }
+    }
+    Ok(matching::members(view, board, rollout))
+}
+
+/// Roll-outs that run and have one of these robots.
+pub(super) fn overlapping<'a>(
+    view: &View,
+    rollout: &Rollout,
+    robots: impl Iterator<Item = &'a RobotId>,
+) -> BTreeSet<RolloutId> {
+    let ids = robots.filter_map(|robot| view.of_robot.get(robot)).flatten().filter(|id| **id != rollout.rollout_id);
+    let open = ids.filter(|id| view.rollout(id).is_some_and(|r| !r.phase.is_over()));
+    open.cloned().collect()
 }

@@ -11,7 +11,7 @@ use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
 
 /// Of one robot with one version, since ever. How hot it was on an errand counts, and nothing else of one.
-fn of(counter: &RobotCounter) -> Effort {
+fn count_effort(counter: &RobotCounter) -> Effort {
     let (stats, errands) = (counter.stats, counter.errands);
     Effort {
         tasks: counter.succeeded.saturating_add(counter.failures.values().sum()),
@@ -26,14 +26,14 @@ fn of(counter: &RobotCounter) -> Effort {
 pub fn of_robot(view: &View, rollout: &Rollout, robot_id: &RobotId) -> Effort {
     let Some(bundle) = view.bundles.get(rollout.spec.bundle.as_str()) else { return Effort::default() };
     let id = format!("{robot_id}@{}", bundle.row.version);
-    view.counters.get(&id).map_or_else(Effort::default, |counter| of(&counter.row))
+    view.counters.get(&id).map_or_else(Effort::default, |counter| count_effort(&counter.row))
 }
 
 /// Of all robots with any other version, since ever.
 pub fn of_controls(view: &View, rollout: &Rollout) -> Effort {
     let version = view.bundles.get(rollout.spec.bundle.as_str()).map(|b| b.row.version.as_str());
     let others = view.counters.values().map(|c| &c.row).filter(|c| Some(c.software.as_str()) != version);
-    others.map(of).fold(Effort::default(), Effort::plus)
+    others.map(count_effort).fold(Effort::default(), Effort::plus)
 }
 
 /// What was seen of both sides by now.
@@ -124,7 +124,7 @@ mod tests {
             energy_mwh: 60,
             hottest_joint_decidegrees: 700,
         };
-        assert_eq!(of(&counter), expected);
+        assert_eq!(count_effort(&counter), expected);
     }
 
     #[test]

@@ -55,7 +55,7 @@ fn is_reached(rollout: &Rollout, r: &RolloutRobot) -> bool {
 }
 
 /// How a roll-out ends, or would as things are. One that was offered to nobody has brought nothing.
-pub fn of(view: &View, rollout: &Rollout) -> Ending {
+pub fn judge_ending(view: &View, rollout: &Rollout) -> Ending {
     let Share { offered, reached } = share(view, rollout);
     let enough =
         offered > 0 && u64::from(reached) * 100 >= u64::from(offered) * u64::from(rollout.spec.complete_percent);
@@ -64,7 +64,7 @@ pub fn of(view: &View, rollout: &Rollout) -> Ending {
 
 /// Decides how it ends: who comes later is served by it, or a person is told.
 pub fn decide(tx: &mut Tx, rollout: &Rollout) -> Ending {
-    let ending = of(tx.view, rollout);
+    let ending = judge_ending(tx.view, rollout);
     match ending {
         Ending::Complete => serve(tx, rollout),
         Ending::Incomplete => {
@@ -82,7 +82,7 @@ pub fn decide(tx: &mut Tx, rollout: &Rollout) -> Ending {
 pub fn reconsider(tx: &mut Tx, id: &RolloutId) {
     let Some(rollout) = tx.view.rollout(id).cloned() else { return };
     let was_short = rollout.phase == Phase::Completed && rollout.outcome == Some(Ending::Incomplete);
-    if was_short && of(tx.view, &rollout) == Ending::Complete {
+    if was_short && judge_ending(tx.view, &rollout) == Ending::Complete {
         serve(tx, &rollout);
         tx.put(Rollout { outcome: Some(Ending::Complete), ..rollout }, "rollout.complete_after_all");
     }

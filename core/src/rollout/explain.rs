@@ -20,7 +20,7 @@ const NAMED_MAX: usize = 8;
 /// Why nothing happens to a robot at this moment.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Blocked {
-    /// Why.
+    /// What it waits for, or what keeps it.
     pub by: Reason,
     /// UTC, site clock.
     pub since: Utc,

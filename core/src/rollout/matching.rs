@@ -16,7 +16,7 @@ use std::collections::{BTreeMap, BTreeSet};
 /// One robot that a roll-out would reach.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Matched {
-    /// Who.
+    /// The robot that would be reached.
     pub robot_id: RobotId,
     /// Its wave, from 0.
     pub wave: u32,

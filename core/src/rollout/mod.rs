@@ -1,11 +1,12 @@
 //! The law of roll-outs: which robot gets which bundle when, what counts for and against it, and the way back.
 //!
 //! [`cycle`] takes what happened and gives items to commit; the service around it only reads, signs, commits and publishes.
-//! Rooms: `spec` is what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens (`refusals`: what robots
-//! would not take); `matching` says who and `dry_run` what it would come to, `robots` says what is due for each (`turns`: whose turn it is)
-//! and `moves` writes it, `phases` the whole, `ending` whether enough have it at the end, `newcomers` who comes later (`served`: what they
-//! get; `assign`: how anybody comes in), `named` which bundles are still needed, `past` what the picture holds of what has ended; `verdict`,
-//! `jams` and `infrastructure` judge, with what `effort` saw; `explain` says what a robot waits for. Rooms name each other in one direction only.
+//! Rooms: `spec` and `requests` are what is asked for, `rows` and `view` are what is known; `hear` and `commands` are what happens
+//! (`refusals`: what robots would not take); `matching` says who and `dry_run` what it would come to, `robots` says what is due for each
+//! (`turns`: whose turn it is) and `moves` writes it, `phases` the whole, `ending` whether enough have it at the end, `newcomers` who comes
+//! later (`served`: what they get; `assign`: how anybody comes in), `named` which bundles are still needed, `past` what the picture holds of
+//! what has ended; `verdict`, `jams` and `infrastructure` judge, with what `effort` saw; `explain` says what a robot waits for. Rooms name
+//! each other in one direction only.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod assign;
@@ -27,6 +28,7 @@ pub mod objects;
 pub mod past;
 pub mod phases;
 pub mod refusals;
+pub mod requests;
 pub mod robots;
 pub mod rows;
 pub mod served;

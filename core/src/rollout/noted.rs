@@ -1,6 +1,6 @@
 //! What a command about software leaves in the audit.
 
-use super::commands::{Command, Verb};
+use super::requests::{Command, Verb};
 use crate::audit::Note;
 use crate::ids::RolloutId;
 

@@ -3,7 +3,8 @@
 //! Invariant: no person approves what it wrote itself, by whatever token; what a caller may not see is for it as if it were not there, and what is not there is refused by nobody here.
 
 use super::Board;
-use super::commands::{Command, Verb, superseded};
+use super::dry_run::superseded;
+use super::requests::{Command, Verb};
 use super::rows::{Quarantine, Rollout};
 use super::view::View;
 use crate::identity::{Caller, Permission, Who};

@@ -27,7 +27,7 @@ impl Record for DesiredUpdate {
 /// What somebody did, when and why.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Act {
-    /// Who.
+    /// The actor that did it, by name.
     pub actor: String,
     /// The person whose token it was; none: none was named, and the actor stands for itself.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -251,9 +251,9 @@ pub enum Outcome {
 pub struct Verdict {
     /// After which wave, from 0.
     pub wave: u32,
-    /// What.
+    /// What follows for the roll-out.
     pub outcome: Outcome,
-    /// Why.
+    /// What was seen that led to it.
     pub reason: Reason,
     /// Robots that were given permission, over the whole roll-out.
     pub attempted: u32,
@@ -275,7 +275,7 @@ pub struct Verdict {
 /// Why a roll-out ends early. Latched.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Abort {
-    /// Why.
+    /// What was seen or asked that ends it.
     pub reason: Reason,
     /// On one event: robots on its bundle get no work from now on, whatever the budget.
     pub hard: bool,
@@ -309,7 +309,7 @@ pub struct Counted {
 /// One roll-out.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Rollout {
-    /// Which.
+    /// Its id, as its author chose it.
     pub rollout_id: RolloutId,
     /// What was asked for.
     pub spec: Arc<RolloutSpec>,
@@ -595,7 +595,7 @@ impl Record for RolloutRobot {
 /// What a robot runs, as far as it said.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RobotSoftware {
-    /// Whose.
+    /// The robot that said it.
     pub robot_id: RobotId,
     /// The bundle it has committed; none: what it came with.
     pub committed: Option<BundleId>,
@@ -656,7 +656,7 @@ pub struct Quarantine {
     pub bundle: BundleId,
     /// In which roll-out.
     pub rollout_id: RolloutId,
-    /// Why.
+    /// What the robot failed by.
     pub reason: Reason,
     /// UTC, site clock.
     pub since: Utc,
@@ -726,4 +726,4 @@ impl Record for OtaClock {
 }
 
 /// A used request_id of a command.
-pub type CommandKey = crate::once::CommandKey<super::commands::Command>;
+pub type CommandKey = crate::once::CommandKey<super::requests::Command>;

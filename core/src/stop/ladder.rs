@@ -15,7 +15,7 @@ pub enum Stage {
     Heard,
     /// Drives slowly.
     Slow,
-    /// Stands.
+    /// Stands where it is.
     Stand,
 }
 

@@ -25,7 +25,7 @@ pub struct Stop {
     pub level: StopLevel,
     /// When, UTC of the stop service's wall. For people, and for how long names are remembered.
     pub engaged: Utc,
-    /// Who.
+    /// The actor that engaged it, by name.
     pub actor: String,
     /// Why, in a person's words, at most [`limits::REASON_BYTES_MAX`] bytes. Empty: none was given.
     pub reason: String,
@@ -93,7 +93,7 @@ pub struct Reset {
     pub stop_id: StopId,
     /// When, UTC of the stop service's wall.
     pub at: Utc,
-    /// Who.
+    /// The actor that reset it, by name.
     pub actor: String,
     /// Why, in a person's words.
     pub reason: String,

@@ -12,13 +12,13 @@ use serde::{Deserialize, Serialize};
 /// A box, millimetres in the site's frame, corners included.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Bounds {
-    /// West.
+    /// Western edge, millimetres.
     pub x0_mm: i32,
-    /// South.
+    /// Southern edge, millimetres.
     pub y0_mm: i32,
-    /// East.
+    /// Eastern edge, millimetres.
     pub x1_mm: i32,
-    /// North.
+    /// Northern edge, millimetres.
     pub y1_mm: i32,
 }
 
@@ -42,7 +42,7 @@ impl Bounds {
     }
 }
 
-/// Where.
+/// A part of the floor, as boxes that cover at least all of it.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Region {
     /// At most [`limits::REGION_BOXES_MAX`], ascending. None at all: nowhere is told, so everywhere.

@@ -14,7 +14,7 @@ pub struct Transport {
     pub robot_id: String,
     /// Empty: no pick leg, only the drive to `to_waypoint`.
     pub from_waypoint: String,
-    /// Goal.
+    /// The waypoint where it ends.
     pub to_waypoint: String,
     /// Item; empty: the body names what it finds.
     pub item_sku: String,

@@ -27,9 +27,9 @@ pub struct RawTask {
     pub minimum_software: String,
     /// Selector: grams.
     pub payload_g: u32,
-    /// Steps.
+    /// Steps in the order in which they are done.
     pub steps: Vec<RawStep>,
-    /// Required.
+    /// Limit of one attempt, milliseconds of site time; required.
     pub timeout_ms: Option<i64>,
     /// Absent: no limit.
     pub schedule_to_start_ms: Option<i64>,
@@ -49,7 +49,7 @@ pub struct RawTask {
     pub coalesce_key: String,
     /// Absent: the area's.
     pub speed_limit_mm_s: Option<u32>,
-    /// Labels.
+    /// Labels of the task, for people and filters.
     pub labels: BTreeMap<String, String>,
     /// Who asked.
     pub requester: String,
@@ -81,7 +81,7 @@ pub struct RawStep {
 pub enum RawStepKind {
     /// Drive to a waypoint.
     Goto(String),
-    /// Act.
+    /// Act where it stands: name of the action, and its parameters.
     Action(String, serde_json::Map<String, serde_json::Value>),
     /// Stand, milliseconds.
     Wait(i64),

@@ -30,7 +30,7 @@ pub struct TaskSpec {
     pub not_before: Option<Utc>,
     /// Worthless after, UTC.
     pub deadline: Option<Utc>,
-    /// Retries.
+    /// How often and when it is tried again.
     pub retry: Retry,
     /// May be suspended at a step boundary for charging or more urgent work.
     pub preemptible: bool,
@@ -57,7 +57,7 @@ pub struct Selector {
     pub capabilities: Vec<String>,
     /// Least version of base software.
     pub minimum_software: Option<String>,
-    /// Grams.
+    /// Grams that the robot must be able to carry.
     pub payload_g: u32,
 }
 

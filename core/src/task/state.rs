@@ -148,9 +148,9 @@ impl Record for TaskState {
 pub enum AttemptPhase {
     /// Written, not answered.
     Offered,
-    /// Taken.
+    /// The robot has taken it.
     Accepted,
-    /// Driving.
+    /// The robot drives.
     Navigating,
     /// Acting or waiting.
     Executing,
@@ -162,11 +162,11 @@ pub enum AttemptPhase {
     Refused,
     /// Nobody answered and the robot confirmed that it does not have it.
     OfferExpired,
-    /// Done.
+    /// The robot has done all steps.
     Succeeded,
     /// Ended by a fault.
     Failed,
-    /// Stopped.
+    /// It was stopped before its end.
     Aborted,
     /// Given up by a person while nobody knew.
     Lost,
@@ -245,7 +245,7 @@ pub enum Errand {
 pub struct Uncertain {
     /// UTC, since when.
     pub since: Utc,
-    /// Why.
+    /// Why nobody knows how it stands.
     pub cause: Reason,
 }
 
@@ -336,16 +336,16 @@ pub enum Resolution {
 pub enum Ask {
     /// End it.
     Cancel {
-        /// Which.
+        /// The task that is to end.
         task_id: TaskId,
         /// End the record at once; robot and places stay kept until the robot reports.
         force: bool,
     },
     /// Answer NEEDS_OPERATOR.
     Resolve {
-        /// Which.
+        /// The task that waits for an operator.
         task_id: TaskId,
-        /// How.
+        /// What the person says of it.
         resolution: Resolution,
     },
     /// Take away `resume:<stop_id>` tokens (of all if none is named) from these tasks and robots.
@@ -387,11 +387,11 @@ impl Ask {
 pub struct TaskRequest {
     /// Drawn at random; unique.
     pub id: String,
-    /// What.
+    /// What the person asks for.
     pub ask: Ask,
     /// Why, as the person said.
     pub reason: String,
-    /// Who.
+    /// The actor that asks, by name.
     pub actor: String,
     /// UTC of the wall.
     pub at_unix_ms: i64,

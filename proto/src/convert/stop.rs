@@ -222,7 +222,7 @@ impl Parse<StopFacts> for link::StopFacts {
 pub enum ToStop {
     /// Who comes, and which stops it keeps.
     Attend {
-        /// Who.
+        /// The robot that comes.
         robot_id: RobotId,
         /// New for each start of its agent.
         boot_id: String,
@@ -338,9 +338,9 @@ impl Parse<CheckIn> for v1::CheckIn {
 pub enum FromStop {
     /// Facts to add.
     Told {
-        /// Engaged.
+        /// Stops that are engaged.
         stops: Vec<Stop>,
-        /// Reset.
+        /// Resets, each of one stop by its id.
         resets: Vec<Reset>,
         /// State of the latch with them.
         generation: u64,

@@ -416,7 +416,7 @@ pub struct TaskFilter {
     pub external_ref: String,
     /// At or after.
     pub created_after: Option<Utc>,
-    /// Before.
+    /// Before this moment, UTC.
     pub created_before: Option<Utc>,
     /// Any of these; empty: all.
     pub task_ids: BTreeSet<TaskId>,

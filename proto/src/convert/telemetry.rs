@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 /// What is known of one robot.
 #[derive(Clone, Copy, Debug)]
 pub struct RobotView<'a> {
-    /// Who.
+    /// The robot's id.
     pub robot_id: &'a RobotId,
     /// Whether it is heard; none: never.
     pub presence: Option<&'a PresenceRow>,

@@ -58,7 +58,7 @@ impl Error {
 pub struct Wanted {
     /// Of its bytes.
     pub digest: Digest,
-    /// Bytes.
+    /// How many bytes it has.
     pub length: u64,
 }
 

@@ -39,9 +39,9 @@ pub enum StopNews {
     },
     /// Facts to add.
     Told {
-        /// Engaged.
+        /// Stops that are engaged.
         stops: Vec<Stop>,
-        /// Reset.
+        /// Resets, each of one stop by its id.
         resets: Vec<Reset>,
         /// State of the latch with them.
         generation: u64,

@@ -154,7 +154,7 @@ pub enum Job {
     },
     /// Have this content, whole and checked.
     Fetch {
-        /// Which.
+        /// Digest and length of the content.
         wanted: Wanted,
         /// Content that a patch may be from: the same component in other sets, the running one first.
         bases: Vec<Digest>,
@@ -163,7 +163,7 @@ pub enum Job {
     },
     /// Fetch and read a manifest.
     Manifest {
-        /// Which.
+        /// Digest and length of the manifest.
         wanted: Wanted,
     },
     /// Make a set of what is there and read it back.
@@ -185,7 +185,7 @@ pub enum Job {
     Migrate {
         /// The set.
         set: Digest,
-        /// What.
+        /// What it is to do.
         due: DueMigration,
     },
     /// Delete what nobody needs.

@@ -16,7 +16,7 @@ use std::sync::Arc;
 /// The set committed last and the one before it, by their names in the switch record.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Committed {
-    /// Last.
+    /// Name of the set that was committed last.
     pub current: String,
     /// Before it; none: nothing is kept.
     pub previous: Option<String>,

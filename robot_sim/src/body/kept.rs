@@ -35,9 +35,9 @@ pub enum Error {
     /// Its file could not be read or written.
     #[error("body file {path}: {source}")]
     File {
-        /// Which.
+        /// The file of the body.
         path: PathBuf,
-        /// Why.
+        /// What the operating system said.
         source: std::io::Error,
     },
 }

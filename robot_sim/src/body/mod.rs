@@ -113,7 +113,7 @@ pub struct Counts {
     pub places: u64,
     /// Picks that closed on nothing.
     pub misses: u64,
-    /// Jams.
+    /// How often it jammed.
     pub jams: u64,
     /// Losses of the network.
     pub silences: u64,

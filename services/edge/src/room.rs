@@ -26,11 +26,11 @@ pub fn connections_max() -> Result<usize, TooFew> {
     let allowed = getrlimit(Resource::Nofile);
     // A system that does not let us is left as it is.
     let _ = setrlimit(Resource::Nofile, Rlimit { current: allowed.maximum, ..allowed });
-    of(getrlimit(Resource::Nofile).current)
+    limit_connections(getrlimit(Resource::Nofile).current)
 }
 
 /// `descriptors`: none is without a limit.
-fn of(descriptors: Option<u64>) -> Result<usize, TooFew> {
+fn limit_connections(descriptors: Option<u64>) -> Result<usize, TooFew> {
     let descriptors = descriptors.unwrap_or(u64::MAX);
     let room = usize::try_from(descriptors).unwrap_or(usize::MAX).saturating_sub(limits::DESCRIPTORS_KEPT);
     if room < limits::CONNECTIONS_LEAST {
@@ -45,9 +45,12 @@ mod tests {
 
     #[test]
     fn files_keep_their_descriptors_and_what_is_too_small_says_what_to_type() {
-        assert_eq!([of(Some(1_024)), of(Some(65_536)), of(None)], [Ok(512), Ok(16_384), Ok(16_384)]);
-        assert_eq!(of(Some(576)), Ok(64));
-        let error = of(Some(575)).unwrap_err();
+        assert_eq!(
+            [limit_connections(Some(1_024)), limit_connections(Some(65_536)), limit_connections(None)],
+            [Ok(512), Ok(16_384), Ok(16_384)]
+        );
+        assert_eq!(limit_connections(Some(576)), Ok(64));
+        let error = limit_connections(Some(575)).unwrap_err();
         assert!(error.to_string().contains("may have 575 files") && error.to_string().contains("ulimit -n"), "{error}");
     }
 }

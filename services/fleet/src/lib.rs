@@ -45,7 +45,7 @@ pub struct Parts {
     pub site_text: String,
     /// What became of the map that this process was started with.
     pub map: MapChange,
-    /// Clocks.
+    /// Where the time of the wall, the link and the site is read.
     pub clock: Arc<dyn Clock>,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: midshift_core::fleet::bugs::Bugs,

@@ -40,7 +40,7 @@ pub async fn prune(store: &dyn Store, clock: &dyn Clock) -> Result<u64, Error> {
 
 /// A used request_id goes with the commands after it; where there are none, here.
 async fn prune_commands(store: &dyn Store, wall: Utc) -> Result<u64, Error> {
-    match privacy::of(Table::CommandKey).before(wall) {
+    match privacy::retention_of(Table::CommandKey).before(wall) {
         Some(before) => aged::take_away(store, Table::CommandKey, before.0, "command.forgotten").await,
         None => Ok(0),
     }
@@ -54,7 +54,7 @@ async fn named(store: &dyn Store) -> Result<BTreeSet<Key>, Error> {
 }
 
 async fn prune_tasks(store: &dyn Store, now: Utc) -> Result<u64, Error> {
-    let Some(before) = privacy::of(Table::TaskState).before(now) else { return Ok(0) };
+    let Some(before) = privacy::retention_of(Table::TaskState).before(now) else { return Ok(0) };
     let terminal: Vec<i64> = Phase::ALL.into_iter().filter(|p| p.is_terminal()).map(Phase::number).collect();
     let (mut after, mut needed, mut gone, mut tasks) = (None, None, 0, 0);
     while tasks < limits::FORGOTTEN_PER_PASS {
@@ -114,7 +114,7 @@ async fn forget_tasks(store: &dyn Store, tasks: &[(TaskState, Row)]) -> Result<u
 
 /// Errands are ordered by when they were offered, behind all attempts of tasks.
 async fn prune_errands(store: &dyn Store, now: Utc) -> Result<u64, Error> {
-    let Some(before) = privacy::of(Table::Attempt).before(now) else { return Ok(0) };
+    let Some(before) = privacy::retention_of(Table::Attempt).before(now) else { return Ok(0) };
     let terminal: Vec<i64> =
         AttemptPhase::ALL.into_iter().filter(|p| p.is_terminal()).map(AttemptPhase::number).collect();
     let mut after = Cursor { order: Attempt::ERRANDS_BEHIND, id: Arc::from("") };

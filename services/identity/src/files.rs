@@ -8,6 +8,9 @@ use std::io::{self, Read};
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::Path;
 
+/// The folder of a server's keys and certificates, below its data folder.
+pub const FOLDER: &str = "identity";
+
 /// Owner alone.
 pub const PRIVATE: u32 = midshift_durable::PRIVATE;
 /// Everybody reads.

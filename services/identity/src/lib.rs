@@ -17,7 +17,7 @@ mod revocation_list;
 mod tokens;
 
 pub use authority::PUBLIC_FILE;
-pub use files::make_folder;
+pub use files::{FOLDER, make_folder};
 pub use proof::ServerProof;
 pub use retention::prune;
 pub use revocation_list::RevocationList;
@@ -52,15 +52,15 @@ pub enum Error {
     /// A file or folder.
     #[error("{path}: {source}", path = path.display())]
     Folder {
-        /// Which.
+        /// Where the file or folder is.
         path: PathBuf,
-        /// Why.
+        /// What the operating system said.
         source: std::io::Error,
     },
     /// A folder or file with keys or other secrets that others may look into.
     #[error("{path} has keys or other secrets and is open to others (mode {mode:03o}): type `chmod go= {path}`, after asking who may have read it", path = path.display())]
     Open {
-        /// Which.
+        /// The folder or file that others may look into.
         path: PathBuf,
         /// Its mode.
         mode: u32,
@@ -68,15 +68,15 @@ pub enum Error {
     /// A key or certificate on disk.
     #[error("{path} is no key and certificate of this build: {source}", path = path.display())]
     Unreadable {
-        /// Which.
+        /// The file with the key or certificate.
         path: PathBuf,
-        /// Why.
+        /// Why it could not be read.
         source: rcgen::Error,
     },
     /// A name that the server is to be called.
     #[error("a name of the server is none: {source}")]
     Names {
-        /// Why.
+        /// Why no certificate can have it.
         source: rcgen::Error,
     },
     /// A key or signature could not be made.
@@ -98,7 +98,7 @@ pub enum Error {
         path: PathBuf,
         /// Which, from 1.
         line: usize,
-        /// Why.
+        /// What the reader of JSON says.
         source: serde_json::Error,
     },
     /// The store.
@@ -115,7 +115,7 @@ pub struct Parts {
     pub folder: PathBuf,
     /// The rows.
     pub store: Arc<dyn Store>,
-    /// Clocks.
+    /// Where the time of the wall, the link and the site is read.
     pub clock: Arc<dyn Clock>,
     /// Whether this process has the site's authority.
     pub duty: Duty,

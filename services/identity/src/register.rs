@@ -23,11 +23,11 @@ const TRIES: usize = 8;
 /// The rows as maps.
 #[derive(Debug, Default)]
 pub struct View {
-    /// Tokens.
+    /// Tokens by their id.
     pub tokens: BTreeMap<TokenId, (TokenRecord, Revision)>,
     /// The newest token of each name.
     pub names: BTreeMap<String, (TokenName, Revision)>,
-    /// Robots.
+    /// Identities of robots, by the robot's id.
     pub robots: BTreeMap<RobotId, (RobotIdentity, Revision)>,
     /// Certificates of servers, by the digest of the key.
     pub servers: BTreeMap<String, (ServerCertificate, Revision)>,

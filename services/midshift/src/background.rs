@@ -139,7 +139,7 @@ pub type Acknowledged = Arc<Mutex<Vec<TaskId>>>;
 pub struct Background {
     /// How much.
     pub pressure: Pressure,
-    /// What.
+    /// Where its tasks come from.
     pub source: Source,
     /// How the request ids of this run begin, and of no other.
     pub run_id: String,

@@ -33,7 +33,7 @@ pub fn before(data: &Path, now: Utc) -> Option<(i64, Utc)> {
 }
 
 /// Keeps each jump of this run, until it is dropped.
-pub async fn keep(data: &Path, clock: &dyn Clock) {
+pub async fn keep_jumps(data: &Path, clock: &dyn Clock) {
     let mut known = None;
     loop {
         let seen = clock.last_jump();
@@ -67,7 +67,7 @@ mod tests {
         let clock = WallClock::new(|| 0, move || Utc(wall.load(Relaxed)), |_: &Jump| {});
         let runs = async || {
             clock.now();
-            let _ = tokio::time::timeout(LOOK_EVERY * 2, keep(folder.path(), &clock)).await;
+            let _ = tokio::time::timeout(LOOK_EVERY * 2, keep_jumps(folder.path(), &clock)).await;
         };
         runs().await;
         assert_eq!(before(folder.path(), began), None);

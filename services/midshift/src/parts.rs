@@ -51,7 +51,7 @@ pub struct Parts {
     pub site_text: String,
     /// What became of the map that this process was started with.
     pub map: MapChange,
-    /// Clocks.
+    /// Where the time of the wall, the link and the site is read.
     pub clock: Arc<dyn Clock>,
     /// What the wall jumped at last before this run, milliseconds ahead, and UTC when it had.
     pub jumped_before: Option<(i64, Utc)>,

@@ -85,7 +85,7 @@ impl Amounts {
 /// The report of a run.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
-    /// Robots.
+    /// How many robots took part.
     pub robots: usize,
     /// Seed of the run.
     pub seed: u64,
@@ -149,9 +149,9 @@ pub struct Report {
 /// Mean and percentiles.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Spread {
-    /// Mean.
+    /// Arithmetic mean.
     pub mean: f64,
-    /// Median.
+    /// Median, the 50th percentile.
     pub p50: f64,
     /// 95th percentile.
     pub p95: f64,
@@ -173,9 +173,9 @@ pub struct Inputs {
     pub seed: u64,
     /// What the client was acknowledged for.
     pub acknowledged: Vec<TaskId>,
-    /// Rows.
+    /// Tasks as their rows say.
     pub tasks: Tasks,
-    /// Bodies.
+    /// What the bodies of the robots say.
     pub bodies: HallReport,
     /// Waits for places.
     pub place_waits: u64,

@@ -83,7 +83,7 @@ impl StopFlags {
 /// One agent with a simulated body.
 #[derive(Clone, Debug, clap::Args)]
 pub struct AgentRun {
-    /// Who.
+    /// The robot that the agent is of.
     #[arg(long)]
     pub robot_id: String,
     /// The server, host:port.

@@ -18,15 +18,14 @@ use midshift_ota::content::Room;
 use midshift_ota::folder::Owner;
 use midshift_ota::rollouts::known_bundles;
 use midshift_ota::{OtaReader, OtaService};
+use midshift_store::Store;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::{TcpListener, UdpSocket};
+use tokio::process::Child;
 use tokio_util::sync::CancellationToken;
-
-/// The folder of keys and certificates below the data folder.
-pub const IDENTITY: &str = "identity";
 
 /// Robots change gateways in a second or two when they are told to; this is for those that are slow to answer.
 const DRAIN_DEFAULT_S: u64 = 20;
@@ -148,7 +147,13 @@ impl Software {
 impl Serve {
     /// The folder of the keys of this process.
     fn own_keys(&self) -> PathBuf {
-        self.identity.clone().unwrap_or_else(|| self.data.join(IDENTITY))
+        self.identity.clone().unwrap_or_else(|| self.data.join(midshift_identity::FOLDER))
+    }
+
+    /// How long robots have to move to another gateway when this process is asked to end.
+    fn drain(&self, roles: &Roles) -> Duration {
+        let default_s = if roles.are_split() { DRAIN_DEFAULT_S } else { 0 };
+        Duration::from_secs(self.drain_seconds.unwrap_or(default_s))
     }
 
     /// What holds for the stop service beside it too, as arguments: its port has the same peers, and its log goes where this one's does.
@@ -163,35 +168,15 @@ pub type Say<'a> = &'a (dyn Fn(&str) + Sync);
 
 /// Runs until `shutdown`. The first token of a site is said, and nothing else.
 pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow::Result<()> {
-    if args.insecure {
-        tracing::warn!(address = %args.listen, "no TLS and no login: whoever reaches this port may move robots");
-    }
     let roles = Roles::of(&args.roles);
-    if roles.are_split() && args.database.store.is_none() {
-        bail!(
-            "--roles {roles} leaves services to other processes, and only PostgreSQL can be shared with them: add --store postgres://USER:PASSWORD@HOST/DATABASE, or leave --roles out to serve everything on SQLite"
-        );
-    }
-    if args.identity.is_some() && roles.has(Role::Identity) {
-        bail!(
-            "--identity is for processes without role identity: the site's authority is in the folder identity of --data, where a backup finds it"
-        );
-    }
+    check_arguments(&args, &roles)?;
     // Before anything is opened: whoever finds the port taken leaves no trace.
-    let listener = TcpListener::bind(args.listen).await.with_context(|| {
-        format!(
-            "listening on {}; if another server has the port, end it or name another one with --listen",
-            args.listen
-        )
-    })?;
+    let listener = listen(args.listen).await?;
     if !args.insecure {
         // The databases have secrets of sessions, whichever process of the site they are of.
         midshift_identity::make_folder(&args.data).context("opening the data folder")?;
     }
-    let loaded = site_file::load(args.site.as_deref(), None, None)?;
-    for warning in &loaded.warnings {
-        tracing::warn!(warning, "site");
-    }
+    let loaded = load_site(&args)?;
     let clock = clock::clock(1000);
     crate::recorder::handle();
     let site_id = loaded.site.site_id().clone();
@@ -201,57 +186,20 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         true => changed_map::choose(&*storage.store(), loaded, args.force_map, clock.now()).await?,
         false => (changed_map::follow(&*storage.store(), loaded).await?, Default::default()),
     };
-    let follows = roles.has(Role::StopFollower);
     // Before anybody writes to the store, and before the stop service, which waits for who is known, can begin.
-    match first_start(&args, &roles) {
-        Some(occasion) => stop::announce(&args.data.join(stop::FOLDER), &*storage.store(), occasion).await?,
-        None if args.init_stop => {
-            bail!("--init-stop is for a process with role stop-follower, which has the stop service's folder")
-        }
-        None => {}
-    }
-    let folder = args.data.join("ota");
-    let identity = match args.insecure {
-        true => None,
-        false => Some(identity(&args, &roles, &storage, &clock, &shutdown).await?),
-    };
-    let ota = match roles.has(Role::Ota) {
-        true => args.software.open(folder.clone(), owner(&storage).await?, clock.clone()).await?,
-        false => OtaService::without_keys(),
-    };
-    let hands_out = roles.has(Role::Telemetry) && !roles.has(Role::Ota) && !args.no_software;
-    let reader = match hands_out {
-        true => Some(reader(&folder, &storage, &shutdown).await?),
-        false => None,
-    };
-    let drain = Duration::from_secs(args.drain_seconds.unwrap_or(if roles.are_split() { DRAIN_DEFAULT_S } else { 0 }));
+    announce_first_start(&args, &roles, &*storage.store()).await?;
+    let identity = open_identity(&args, &roles, &storage, &clock, &shutdown).await?;
+    let (ota, reader) = open_software(&args, &roles, &storage, &clock, &shutdown).await?;
     let beacons = match args.beacon_listen {
         Some(address) => Some(hear(address).await?),
         None => None,
     };
-    let has_stop = !args.no_stop && !roles.are_split();
-    let beside = stop::Started {
-        site: args.site.clone(),
-        data: args.data.clone(),
-        listen: args.stop_listen,
-        authority_pem: identity.as_ref().map(|identity| identity.proof().borrow().authority_pem.clone()),
-        arguments: args.for_stop(),
-    };
-    let mut started = None;
-    if has_stop {
-        let copied = stop_follower::tell_stops(&args.data.join(stop::FOLDER), &*storage.store()).await;
-        copied.context("telling the stop service what is engaged")?;
-        if let Some(identity) = &identity {
-            stop_follower::tell_principals(&args.data.join(stop::FOLDER), identity)
-                .context("telling the stop service who is known")?;
-        }
-        started = beside.start().await?;
-    }
+    let beside = start_stop(&args, &roles, &*storage.store(), identity.as_ref()).await?;
     tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), store = storage.engine(), %roles, "midshift serves");
     let planning = Planning::start()?;
     let parts = Parts {
         roles: roles.clone(),
-        drain,
+        drain: args.drain(&roles),
         store: storage.store(),
         frames: storage.frames(),
         heard: storage.heard(),
@@ -264,8 +212,8 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         reader,
         sim: None,
         naive: Naive::default(),
-        stops: follows.then(|| args.data.join(stop::FOLDER)),
-        stop_port: has_stop.then(|| args.stop_listen.port()),
+        stops: roles.has(Role::StopFollower).then(|| args.data.join(stop::FOLDER)),
+        stop_port: beside.is_some().then(|| args.stop_listen.port()),
         port: match identity {
             Some(_) => args.share.config("business")?,
             None => door::alone("business"),
@@ -277,22 +225,62 @@ pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyh
         greet(&args, &roles, identity, listener.local_addr()?, say).await?;
     }
     let server = Server::new(parts, shutdown).await?.hearing(beacons);
-    let kept = async {
-        match has_stop {
-            true => beside.keep(started, &*storage.store()).await,
-            false => std::future::pending().await,
-        }
-    };
     let rows = storage.store();
     let served = tokio::select! {
         served = server.serve(listener) => served,
-        () = kept => Ok(()),
+        () = keep_stop(beside, &*rows) => Ok(()),
         () = backup::told::run(&args.data, &*rows) => Ok(()),
-        () = clock_jump::keep(&args.data, &*clock) => Ok(()),
+        () = clock_jump::keep_jumps(&args.data, &*clock) => Ok(()),
         () = clock_doubt::run(&args.data, &*clock, &*rows) => Ok(()),
     };
     storage.close().await;
     served
+}
+
+/// Refuses arguments that do not go together with `roles`.
+fn check_arguments(args: &Serve, roles: &Roles) -> anyhow::Result<()> {
+    if args.insecure {
+        tracing::warn!(address = %args.listen, "no TLS and no login: whoever reaches this port may move robots");
+    }
+    if roles.are_split() && args.database.store.is_none() {
+        bail!(
+            "--roles {roles} leaves services to other processes, and only PostgreSQL can be shared with them: add --store postgres://USER:PASSWORD@HOST/DATABASE, or leave --roles out to serve everything on SQLite"
+        );
+    }
+    if args.identity.is_some() && roles.has(Role::Identity) {
+        bail!(
+            "--identity is for processes without role identity: the site's authority is in the folder identity of --data, where a backup finds it"
+        );
+    }
+    Ok(())
+}
+
+/// The socket that clients and robots come to.
+async fn listen(address: SocketAddr) -> anyhow::Result<TcpListener> {
+    TcpListener::bind(address).await.with_context(|| {
+        format!("listening on {address}; if another server has the port, end it or name another one with --listen")
+    })
+}
+
+/// Reads the site file, and logs what its lint has to say.
+fn load_site(args: &Serve) -> anyhow::Result<site_file::Loaded> {
+    let loaded = site_file::load(args.site.as_deref(), None, None)?;
+    for warning in &loaded.warnings {
+        tracing::warn!(warning, "site");
+    }
+    Ok(loaded)
+}
+
+/// Tells the stop service beside this process whether it may begin with nothing engaged, if this process has its folder.
+async fn announce_first_start(args: &Serve, roles: &Roles, store: &dyn Store) -> anyhow::Result<()> {
+    match first_start(args, roles) {
+        Some(occasion) => stop::announce(&args.data.join(stop::FOLDER), store, occasion).await?,
+        None if args.init_stop => {
+            bail!("--init-stop is for a process with role stop-follower, which has the stop service's folder")
+        }
+        None => {}
+    }
+    Ok(())
 }
 
 /// On which occasion this process may announce a first start of the stop service beside it. None: it has not its folder.
@@ -304,14 +292,18 @@ fn first_start(args: &Serve, roles: &Roles) -> Option<stop::Occasion> {
     })
 }
 
-/// Who is who, with the site's authority if this process has the role, and with the certificate of this process.
-async fn identity(
+/// Opens the service of identity, with the site's authority if this process has the role, and with the certificate of this
+/// process. None: no login.
+async fn open_identity(
     args: &Serve,
     roles: &Roles,
     storage: &Storage,
     clock: &Arc<dyn Clock>,
     shutdown: &CancellationToken,
-) -> anyhow::Result<IdentityService> {
+) -> anyhow::Result<Option<IdentityService>> {
+    if args.insecure {
+        return Ok(None);
+    }
     let mut names = args.names.clone();
     if !args.listen.ip().is_unspecified() {
         names.push(args.listen.ip().to_string());
@@ -332,7 +324,7 @@ async fn identity(
         let root = identity.proof().borrow().authority_pem.clone();
         midshift_durable::replace(file, root.as_bytes()).with_context(|| format!("writing {}", file.display()))?;
     }
-    Ok(identity)
+    Ok(Some(identity))
 }
 
 /// Hands out the first token of a new site, once.
@@ -377,6 +369,64 @@ fn shown(address: SocketAddr, names: &[String]) -> String {
         Some(name) if address.ip().is_unspecified() => format!("{name}:{}", address.port()),
         None if address.ip().is_unspecified() => SocketAddr::new(loopback, address.port()).to_string(),
         _ => address.to_string(),
+    }
+}
+
+/// Opens the service of software, and of a gateway without role ota the folder of releases that other processes keep.
+async fn open_software(
+    args: &Serve,
+    roles: &Roles,
+    storage: &Storage,
+    clock: &Arc<dyn Clock>,
+    shutdown: &CancellationToken,
+) -> anyhow::Result<(OtaService, Option<OtaReader>)> {
+    let folder = args.data.join("ota");
+    let ota = match roles.has(Role::Ota) {
+        true => args.software.open(folder.clone(), owner(storage).await?, clock.clone()).await?,
+        false => OtaService::without_keys(),
+    };
+    let hands_out = roles.has(Role::Telemetry) && !roles.has(Role::Ota) && !args.no_software;
+    let reader = match hands_out {
+        true => Some(reader(&folder, storage, shutdown).await?),
+        false => None,
+    };
+    Ok((ota, reader))
+}
+
+/// A stop service beside this process. Its child is none where one answered already.
+type StopBeside = (stop::Started, Option<Child>);
+
+/// Tells the stop service beside this process what is engaged and who is known, and starts it unless one answers. None: it runs elsewhere.
+async fn start_stop(
+    args: &Serve,
+    roles: &Roles,
+    store: &dyn Store,
+    identity: Option<&IdentityService>,
+) -> anyhow::Result<Option<StopBeside>> {
+    if args.no_stop || roles.are_split() {
+        return Ok(None);
+    }
+    let folder = args.data.join(stop::FOLDER);
+    stop_follower::tell_stops(&folder, store).await.context("telling the stop service what is engaged")?;
+    if let Some(identity) = identity {
+        stop_follower::tell_principals(&folder, identity).context("telling the stop service who is known")?;
+    }
+    let program = stop::Started {
+        site: args.site.clone(),
+        data: args.data.clone(),
+        listen: args.stop_listen,
+        authority_pem: identity.map(|identity| identity.proof().borrow().authority_pem.clone()),
+        arguments: args.for_stop(),
+    };
+    let child = program.start().await?;
+    Ok(Some((program, child)))
+}
+
+/// Starts the stop service beside this process again whenever it is gone. Waits for ever where there is none.
+async fn keep_stop(beside: Option<StopBeside>, store: &dyn Store) {
+    match beside {
+        Some((program, child)) => program.keep(child, store).await,
+        None => std::future::pending().await,
     }
 }
 

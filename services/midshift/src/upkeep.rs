@@ -50,7 +50,7 @@ async fn prune(parts: &Parts, task: Option<TaskService>) {
         tokio::time::sleep(PRUNE_EVERY).await;
         let turn = Turn { store, frames, clock, task: task.as_ref() };
         turn.take(|role| parts.roles.has(role)).await;
-        if let Err(error) = oldest::tell(store, frames, clock).await {
+        if let Err(error) = oldest::publish_ages(store, frames, clock).await {
             tracing::warn!(%error, "how old the oldest rows are cannot be read");
         }
     }
@@ -60,9 +60,9 @@ async fn prune(parts: &Parts, task: Option<TaskService>) {
 pub struct Turn<'t> {
     /// Rows and entries.
     pub store: &'t dyn Store,
-    /// Samples.
+    /// The log of STATUS samples.
     pub frames: &'t dyn FrameLog,
-    /// Clocks.
+    /// The clock that ages are held against.
     pub clock: &'t dyn Clock,
     /// Intake of tasks, in a process that has it.
     pub task: Option<&'t TaskService>,
@@ -122,7 +122,7 @@ async fn keep_audit(parts: &Parts) {
     let writers: Vec<Writer> = of_roles.chain(parts.stops.is_some().then_some(Writer::Stop)).collect();
     loop {
         for writer in &writers {
-            if let Err(error) = audit::keep(parts.store.as_ref(), parts.clock.as_ref(), *writer).await {
+            if let Err(error) = audit::maintain_chain(parts.store.as_ref(), parts.clock.as_ref(), *writer).await {
                 tracing::warn!(%error, chain = writer.as_str(), "a chain of the audit was not looked after");
             }
         }

@@ -63,7 +63,7 @@ pub enum Error {
     NoKeyFile {
         /// Where they should be.
         folder: PathBuf,
-        /// Whose.
+        /// The role whose keys are missing.
         role: &'static str,
     },
     /// None of the server's keys may sign.
@@ -73,7 +73,7 @@ pub enum Error {
     NotNamed {
         /// The root.
         root_version: u64,
-        /// Whose.
+        /// The role that has other keys there.
         role: &'static str,
     },
     /// The folder is not this store's, or not there.
@@ -134,9 +134,9 @@ pub struct Release {
 /// Who publishes, and when.
 #[derive(Clone, Debug)]
 pub struct Act {
-    /// Who.
+    /// The actor that publishes.
     pub by: Actor,
-    /// When.
+    /// When it publishes, UTC of the wall.
     pub at: Utc,
 }
 

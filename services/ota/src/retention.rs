@@ -26,7 +26,7 @@ const ROBOTS_AT_ONCE: usize = limits::ITEM_ROWS_MAX - 1;
 /// If the store does not answer.
 pub async fn prune(store: &dyn Store, clock: &dyn Clock) -> Result<u64, Error> {
     let now = clock.now();
-    let keys = match privacy::of(Table::OtaCommandKey).before(now.steady_wall()) {
+    let keys = match privacy::retention_of(Table::OtaCommandKey).before(now.steady_wall()) {
         Some(before) => aged::take_away(store, Table::OtaCommandKey, before.0, "command.forgotten").await?,
         None => 0,
     };

@@ -18,21 +18,21 @@ use std::collections::BTreeSet;
 
 /// What somebody wants stopped.
 pub struct Wanted {
-    /// Whom.
+    /// The robots that it is for.
     pub scope: Scope,
-    /// How.
+    /// The level that they are to obey.
     pub level: StopLevel,
     /// Why; may be empty.
     pub reason: String,
     /// Protects against a double call, with the hash of the request.
     pub request: Option<(RequestId, String)>,
-    /// Who.
+    /// The actor that asks for it.
     pub actor: Actor,
 }
 
 /// A stop that is engaged.
 pub struct Engaged {
-    /// It.
+    /// The stop as the latch has it.
     pub stop: Stop,
     /// What the disk must have had its turn with.
     pub version: u64,

@@ -50,9 +50,9 @@ pub enum Action {
 pub struct Note {
     /// When, UTC of the wall.
     pub at: Utc,
-    /// Who.
+    /// The actor that did it, by name.
     pub actor: String,
-    /// What.
+    /// What was done.
     pub action: Action,
     /// Ids, levels, reasons.
     pub fields: BTreeMap<String, String>,
@@ -253,7 +253,7 @@ pub enum Broken {
     /// All lines hold together, and are not those that were written.
     #[error("record {n} is not the one that the latch knows: the lines were written anew")]
     Rewritten {
-        /// Which.
+        /// Number of the record that the latch knows with another hash.
         n: u64,
     },
 }
@@ -261,7 +261,7 @@ pub enum Broken {
 /// An audit that holds together.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Verified {
-    /// Records.
+    /// How many records it has.
     pub records: u64,
     /// The hash of the last one; empty: there is none. Who notes it elsewhere can tell later whether the file still begins with these records.
     pub hash: String,

@@ -38,7 +38,7 @@ pub struct Asked {
     pub stop_id: StopId,
     /// SHA-256 of the request, hexadecimal.
     pub hash: String,
-    /// When.
+    /// When it was asked, UTC of the stop service's wall.
     pub at: Utc,
 }
 

@@ -69,7 +69,7 @@ pub enum Error {
     /// The folder says no.
     #[error("opening the folder of stops {path}: {source}", path = path.display())]
     Folder {
-        /// Which.
+        /// The folder of stops.
         path: PathBuf,
         /// Why not.
         source: io::Error,
@@ -99,7 +99,7 @@ pub struct Parts {
     pub folder: PathBuf,
     /// Where areas and zones are. None: every part means everywhere.
     pub site: Option<Arc<Site>>,
-    /// Clocks.
+    /// Where the time of the wall and of the link is read.
     pub clock: Arc<dyn Clock>,
 }
 
@@ -317,7 +317,7 @@ impl StopService {
         let following = async {
             tokio::select! {
                 () = shutdown.cancelled() => {}
-                () = snapshot::keep(&inner, self.folder.clone()) => {}
+                () = snapshot::follow_files(&inner, self.folder.clone()) => {}
             }
         };
         tokio::join!(disk::keep(&inner, writer), moving, following);

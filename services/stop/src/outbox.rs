@@ -23,7 +23,7 @@ use tonic::Status;
 pub struct Frame {
     /// State of the latch with it.
     pub generation: u64,
-    /// Encoded.
+    /// The message as it is sent, encoded.
     pub bytes: Bytes,
     /// What it resets, so that it can be said again.
     pub resets: Arc<[StopId]>,

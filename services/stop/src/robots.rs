@@ -14,7 +14,7 @@ use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard};
 
 /// One robot.
 pub struct Robot {
-    /// Who.
+    /// The robot's id.
     pub robot_id: RobotId,
     said: Mutex<Said>,
 }

@@ -166,7 +166,7 @@ fn look_at_both(folder: &Path, marks: [Option<Mark>; 2]) -> Looked {
 }
 
 fn take_both(inner: &Inner, looked: Looked) -> [Option<Mark>; 2] {
-    looked.roster.into_iter().for_each(|roster| take(inner, roster));
+    looked.roster.into_iter().for_each(|roster| apply_roster(inner, roster));
     match looked.copied {
         Some(Ok(copied)) => acts::take_copied(inner, copied.stops),
         Some(Err(error)) => tracing::error!(error, "the stops that the store has cannot be read; those here stay"),
@@ -181,7 +181,7 @@ pub fn look_first(inner: &Inner, folder: &Path) {
 }
 
 /// Follows the files until the task is ended.
-pub async fn keep(inner: &Inner, folder: PathBuf) {
+pub async fn follow_files(inner: &Inner, folder: PathBuf) {
     let mut known = [None, None];
     loop {
         tokio::time::sleep(LOOK_EVERY).await;
@@ -195,7 +195,7 @@ pub async fn keep(inner: &Inner, folder: PathBuf) {
 }
 
 /// Puts a roster in force.
-fn take(inner: &Inner, roster: Result<Roster, String>) {
+fn apply_roster(inner: &Inner, roster: Result<Roster, String>) {
     match roster {
         Ok(roster) => {
             inner.robots.list(&roster.robots, inner.clock.now().link);

@@ -24,7 +24,7 @@ const RING_BYTES_MAX: usize = 64;
 /// Consecutive STATUS samples of one robot, encoded by the caller.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Frame {
-    /// Whose.
+    /// The robot that made them.
     pub robot_id: RobotId,
     /// The robot's ring that numbers them.
     pub ring: Arc<str>,
@@ -50,7 +50,7 @@ pub struct StoredFrame {
 /// How far a robot's ring has become durable: the acknowledgement.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FrameMark {
-    /// Whose.
+    /// The robot that the ring is of.
     pub robot_id: RobotId,
     /// Its ring.
     pub ring: Arc<str>,
@@ -61,7 +61,7 @@ pub struct FrameMark {
 /// Samples that will never come, and why.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Gap {
-    /// Whose.
+    /// The robot that lost them.
     pub robot_id: RobotId,
     /// Its ring.
     pub ring: Arc<str>,

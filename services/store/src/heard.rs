@@ -22,7 +22,7 @@ const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// The newest heartbeat of one robot.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Heard {
-    /// Whose.
+    /// The robot that sent it.
     pub robot_id: RobotId,
     /// Session that it came in.
     pub session_epoch: u64,

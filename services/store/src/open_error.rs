@@ -11,7 +11,7 @@ pub enum OpenError {
     Io {
         /// What was being done.
         doing: &'static str,
-        /// Why.
+        /// What the operating system said.
         #[source]
         source: std::io::Error,
     },
@@ -26,7 +26,7 @@ pub enum OpenError {
     Sql {
         /// What was being done.
         doing: &'static str,
-        /// Why.
+        /// What the database said.
         #[source]
         source: sqlx::Error,
     },
@@ -44,7 +44,7 @@ pub enum OpenError {
         "the database has no tables of schema {schema}, so a copy of it is not whole: bring it up with midshift migrate --store"
     )]
     NoSchema {
-        /// Which.
+        /// Name of the schema without tables.
         schema: &'static str,
     },
     /// A commit would not be durable.

@@ -37,7 +37,7 @@ pub struct Parts {
     pub store: Arc<dyn Store>,
     /// The site, whose waypoints tasks may name.
     pub site: Arc<Site>,
-    /// Clocks.
+    /// Where the time of the wall, the link and the site is read.
     pub clock: Arc<dyn Clock>,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: Bugs,

@@ -13,7 +13,7 @@ use std::collections::BTreeSet;
 
 /// Rows of one item, which others' commits pass between.
 const SLICE: usize = 200;
-/// What goes by the wall, after as long as [`privacy::of`] says, and how the log calls it.
+/// What goes by the wall, after as long as [`privacy::retention_of`] says, and how the log calls it.
 const KEPT: [(Table, &str); 2] = [(Table::RequestKey, "request.forgotten"), (Table::TaskRequest, "task.ask_forgotten")];
 
 impl TaskService {
@@ -24,7 +24,7 @@ impl TaskService {
     pub async fn prune(&self) -> Result<u64, Error> {
         let (mut gone, now) = (0, self.inner.parts.clock.now().steady_wall());
         for (table, kind) in KEPT {
-            if let Some(before) = privacy::of(table).before(now) {
+            if let Some(before) = privacy::retention_of(table).before(now) {
                 gone += aged::take_away(self.store(), table, before.0, kind).await?;
             }
         }
@@ -33,7 +33,8 @@ impl TaskService {
 
     /// What was asked for goes after its task: fleet takes the state of a task away when it ended long ago.
     async fn prune_intakes(&self) -> Result<u64, Error> {
-        let Some(before) = privacy::of(Table::TaskIntake).before(self.inner.parts.clock.now().steady_utc()) else {
+        let Some(before) = privacy::retention_of(Table::TaskIntake).before(self.inner.parts.clock.now().steady_utc())
+        else {
             return Ok(0);
         };
         let (mut after, mut gone) = (None, 0);

@@ -53,7 +53,7 @@ pub struct Parts {
     pub board: Arc<LiveBoard<Live>>,
     /// Where other processes read them, if any may open the store too.
     pub heard: Option<Arc<dyn HeardLog>>,
-    /// Clocks.
+    /// Where the time of the wall, the link and the site is read.
     pub clock: Arc<dyn Clock>,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: Bugs,

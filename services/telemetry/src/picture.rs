@@ -41,7 +41,7 @@ pub struct Rows {
     pub sessions: BTreeMap<RobotId, Session>,
     /// What people decided about robots; here for the labels that they gave.
     pub control: BTreeMap<RobotId, RobotControl>,
-    /// Presence.
+    /// Whether each robot is heard.
     pub presence: BTreeMap<RobotId, PresenceRow>,
     /// Durable numbers, by row id.
     pub marks: BTreeMap<String, LaneMark>,

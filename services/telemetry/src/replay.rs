@@ -21,7 +21,7 @@ pub const WAITING_MAX: usize = 1;
 /// One batch for a session in charge.
 #[derive(Debug)]
 pub struct Replay {
-    /// It.
+    /// Samples and gaps of one lane.
     pub batch: LaneBatch,
     /// Who waits for what becomes of it; dropped if the session ends before.
     pub answer: oneshot::Sender<Result<LaneAck, Refusal>>,

@@ -396,7 +396,7 @@ impl Server {
     pub fn way(&self) -> anyhow::Result<Way> {
         known(self.address).map(|site| site.way).context("the site has no login")
     }
-    /// Tasks.
+    /// A client of the service of tasks.
     pub fn tasks(&self) -> anyhow::Result<TaskServiceClient<Line>> {
         tasks(self.address)
     }

@@ -119,7 +119,7 @@ impl Robot {
 pub struct Doors {
     /// People and programs.
     pub people: SocketAddr,
-    /// Robots.
+    /// Where robots have their sessions.
     pub robots: SocketAddr,
     /// Their stop lines, if they have one.
     pub stops: Option<SocketAddr>,

@@ -30,7 +30,7 @@ pub enum Order {
     },
     /// Take a completed one back.
     Rollback {
-        /// Which.
+        /// Id of the completed roll-out.
         of: String,
         /// Id of the other.
         id: String,
@@ -53,7 +53,7 @@ pub enum Order {
     Drain(String),
     /// A person lets a robot go on that its own safety system had stopped.
     LetGo {
-        /// Whom.
+        /// The robot that may go on.
         robot_id: String,
         /// Never used again.
         request_id: String,

@@ -38,7 +38,7 @@ pub enum Fault {
     },
     /// An agent's process dies.
     AgentCrash {
-        /// Whose.
+        /// The robot's number, from 0.
         robot: usize,
         /// With the network.
         power: bool,
@@ -80,11 +80,11 @@ impl Fault {
 /// One fault in time, milliseconds from the beginning.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Window {
-    /// What.
+    /// What is wrong meanwhile.
     pub fault: Fault,
-    /// From.
+    /// When it begins.
     pub from_ms: u64,
-    /// To.
+    /// When it ends.
     pub to_ms: u64,
 }
 
@@ -93,7 +93,7 @@ pub struct Window {
 pub enum Deed {
     /// Begin a roll-out. Its number is its place among those of the run.
     Begin {
-        /// Release.
+        /// Version of the release.
         version: &'static str,
         /// For these.
         robots: BTreeSet<usize>,

@@ -108,7 +108,7 @@ pub struct Room {
     pub wire: Wire,
     /// The stop service, if there is one.
     pub stop: Option<Stops>,
-    /// Releases.
+    /// Releases that robots may have.
     pub software: Arc<Software>,
     /// The memory of the server.
     pub store: Arc<MemoryStore>,

@@ -55,7 +55,7 @@ const TOLD: [&str; 11] = [
 /// Which programs are of the next version.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Pair {
-    /// None.
+    /// Neither the server nor an agent.
     Equal,
     /// None, and the server is killed in the roll-out and started again.
     EqualKilled,

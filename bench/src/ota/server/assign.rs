@@ -26,7 +26,7 @@ pub const ID: &str = "bench-1";
 /// What robots do with a directive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Robots {
-    /// Nothing.
+    /// They hear it and say nothing.
     Hear,
     /// They say at once that they have taken it, as real ones do.
     Take,

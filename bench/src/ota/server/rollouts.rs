@@ -67,7 +67,7 @@ impl Rollouts {
         self.0.approve_rollout(approve).await.context("approving a roll-out")?;
         Ok(())
     }
-    /// Begins.
+    /// Starts a roll-out that was approved.
     pub async fn start(&mut self, id: &str) -> anyhow::Result<()> {
         let (rollout_id, reason) = (id.to_owned(), WHY.to_owned());
         let request = v1::StartRolloutRequest { rollout_id, etag: String::new(), reason, supersede: false };

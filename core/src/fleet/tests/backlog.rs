@@ -8,7 +8,7 @@ use crate::limits;
 use crate::reason::Code;
 use crate::task::Phase;
 
-/// Milliseconds.
+/// Milliseconds of a minute.
 const MINUTE: u64 = 60_000;
 
 fn reason(rig: &Rig, id: &str) -> Option<Code> {

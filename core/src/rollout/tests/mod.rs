@@ -28,7 +28,8 @@ mod trial_and_gates;
 mod waves_and_matching;
 mod ways_back;
 
-use super::commands::{self, Command, Verb};
+use super::commands;
+use super::requests::{Command, Verb};
 use super::rows::{AreaBundle, Bundle, Outcome, Phase, RobotSoftware, Rollout, RolloutRobot, Step};
 use super::spec::{RolloutSpec, Wave};
 use super::view::{Slot, View, WHOLE};

@@ -1,9 +1,9 @@
 //! Commands that are only checked, and commands that are sent twice.
 
-use super::commands::{Ask, CheckOnly, Taken};
 use super::*;
 use crate::identity::Caller;
 use crate::once::CommandKey;
+use crate::rollout::requests::{Ask, CheckOnly, Taken};
 
 fn pin(n: usize) -> Command {
     Command::Pin { robot_id: robot_id(n), reason: "trial".into() }

@@ -1,10 +1,10 @@
 //! Who may ask what about roll-outs: robots 0 to 3 stand in the hall, 4 to 7 in the quality room.
 
-use super::commands::{Ask, CheckOnly};
 use super::*;
 use crate::identity::{Caller, TokenId};
 use crate::reason::Kind;
 use crate::rollout::objects;
+use crate::rollout::requests::{Ask, CheckOnly};
 use crate::rollout::rows::Act;
 
 fn holder(name: &str, grants: &[&str]) -> Caller {

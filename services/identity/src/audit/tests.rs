@@ -50,7 +50,7 @@ impl World {
         assert!(self.service.store.commit(vec![item]).await.iter().all(Result::is_ok));
     }
     async fn keep(&self, writer: Writer) {
-        upkeep::keep(&*self.service.store, &*self.wall, writer).await.unwrap_or_else(|e| panic!("{e}"));
+        upkeep::maintain_chain(&*self.service.store, &*self.wall, writer).await.unwrap_or_else(|e| panic!("{e}"));
     }
     /// All rows that fit, page by page, as `service:n`, and how many pages it took.
     async fn list(&self, mut request: v1::ListAuditRequest) -> (Vec<String>, usize) {

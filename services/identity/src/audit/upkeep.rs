@@ -17,7 +17,7 @@ const SLICES_MAX: usize = 20;
 ///
 /// # Errors
 /// If the store cannot be read or written; what is left is done another time.
-pub async fn keep(store: &dyn Store, clock: &dyn Clock, writer: Writer) -> Result<(), Error> {
+pub async fn maintain_chain(store: &dyn Store, clock: &dyn Clock, writer: Writer) -> Result<(), Error> {
     let Some(table) = Table::audit_of(writer) else { return Ok(()) };
     let now = clock.now().wall.0;
     let newest = Query { newest_first: true, limit: 1, ..Query::all(table).in_states([Kind::Anchor.number()]) };
@@ -26,7 +26,7 @@ pub async fn keep(store: &dyn Store, clock: &dyn Clock, writer: Writer) -> Resul
     if last.is_none_or(|last| now.abs_diff(last) >= limits::AUDIT_ANCHOR_EVERY_MS) {
         write(store, writer, Note::anchor()).await?;
     }
-    let Some(before) = privacy::of(table).before(clock.now().steady_wall()) else { return Ok(()) };
+    let Some(before) = privacy::retention_of(table).before(clock.now().steady_wall()) else { return Ok(()) };
     for _ in 0..SLICES_MAX {
         let oldest = store.list(Query::all(table)).await?;
         let old = oldest.iter().take_while(|row| at(row).is_some_and(|at| at < before.0)).count();

@@ -5,7 +5,6 @@
 
 use super::blocking;
 use super::part::Making;
-use crate::serve::IDENTITY;
 use anyhow::{Context, bail};
 use midshift_core::identity::Revocation;
 use midshift_core::ids::SiteId;
@@ -108,7 +107,7 @@ impl Access {
             }
         };
         if let Some(list) = self.revocations.clone() {
-            blocking(move || keep(&list, &data.join(IDENTITY))).await?;
+            blocking(move || copy_list(&list, &data.join(midshift_identity::FOLDER))).await?;
         }
         Ok(settled)
     }
@@ -141,7 +140,7 @@ fn nothing() -> (Item, Settled) {
 }
 
 /// The list goes on in the restored server: what it names, and these rows do not know, may be in a later backup.
-fn keep(list: &Path, folder: &Path) -> anyhow::Result<()> {
+fn copy_list(list: &Path, folder: &Path) -> anyhow::Result<()> {
     let lines = fs::read(list).with_context(|| format!("reading {}", list.display()))?;
     midshift_identity::make_folder(folder)
         .with_context(|| format!("keeping what was taken back: {} must be a folder", folder.display()))?;
@@ -160,12 +159,12 @@ mod tests {
         let dir = tempfile::tempdir().expect("a folder");
         let at = |name: &str| dir.path().join(name);
         fs::write(at("list"), "{}\n").expect("written");
-        keep(&at("list"), &at("identity")).expect("kept");
+        copy_list(&at("list"), &at("identity")).expect("kept");
         let kept = at("identity").join(RevocationList::FILE);
         let mode = |path: &Path| fs::metadata(path).expect("there").permissions().mode() & 0o777;
         assert_eq!((mode(&at("identity")), mode(&kept)), (0o700, 0o600));
         assert_eq!(fs::read_to_string(kept).expect("read"), "{}\n");
-        let error = keep(&at("list"), &at("list")).expect_err("a file is there");
+        let error = copy_list(&at("list"), &at("list")).expect_err("a file is there");
         assert!(format!("{error:#}").contains("must be a folder"), "{error:#}");
     }
 }

@@ -3,10 +3,9 @@
 use super::files::{copy, entries};
 use super::part::{Making, Part, Said};
 use super::{Places, blocking};
-use crate::serve::IDENTITY;
 use anyhow::ensure;
 use async_trait::async_trait;
-use midshift_identity::RevocationList;
+use midshift_identity::{FOLDER, RevocationList};
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
@@ -20,10 +19,10 @@ const AUTHORITY: &str = "authority.pem";
 #[async_trait]
 impl Part for Identity {
     fn name(&self) -> &'static str {
-        IDENTITY
+        FOLDER
     }
     async fn copy(&self, from: &Places, folder: &Path, _said: &mut Said) -> anyhow::Result<bool> {
-        let (from, folder) = (from.data.join(IDENTITY), folder.to_owned());
+        let (from, folder) = (from.data.join(FOLDER), folder.to_owned());
         blocking(move || {
             if !from.is_dir() {
                 return Ok(false);
@@ -42,7 +41,7 @@ impl Part for Identity {
         .await
     }
     async fn put_back(&self, folder: &Path, to: &mut Making) -> anyhow::Result<()> {
-        let (from, to) = (folder.to_owned(), to.places.data.join(IDENTITY));
+        let (from, to) = (folder.to_owned(), to.places.data.join(FOLDER));
         blocking(move || carry(&from, &to)).await
     }
 }

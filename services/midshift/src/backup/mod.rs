@@ -65,7 +65,7 @@ struct List {
     format: u32,
     /// Which release wrote it.
     midshift: String,
-    /// Whose.
+    /// The site that the server is of.
     site_id: String,
     /// When it was begun, unix milliseconds.
     begun_unix_ms: i64,
@@ -78,7 +78,7 @@ struct List {
 /// What a backup holds, for people.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Summary {
-    /// Whose.
+    /// The site that the server is of.
     pub site_id: String,
     /// When it was begun.
     pub begun: Utc,

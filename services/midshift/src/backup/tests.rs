@@ -332,7 +332,7 @@ pub async fn let_in(store: &dyn Store) -> (bool, bool) {
 async fn whoever_was_revoked_since_the_backup_is_let_in_again_by_nothing_but_a_persons_word() {
     let used = Used::new().await;
     used.store.commit(vec![somebody_known()]).await.remove(0).expect("applied");
-    let identity = used.places().data.join(crate::serve::IDENTITY);
+    let identity = used.places().data.join(midshift_identity::FOLDER);
     fs::create_dir_all(&identity).expect("a folder");
     fs::write(identity.join("authority.pem"), "PRIVATE KEY-----\n-----END CERTIFICATE-----\n").expect("written");
     fs::write(identity.join(RevocationList::FILE), "").expect("written");

@@ -15,14 +15,14 @@ pub enum Verb {
     Get {
         #[command(flatten)]
         call: Call,
-        /// Which.
+        /// Id of the area.
         area_id: String,
     },
     /// Change rules of an area; what is not named stays. Pushed to every robot.
     Put {
         #[command(flatten)]
         call: Call,
-        /// Which.
+        /// Id of the area.
         area_id: String,
         /// Millimetres per second.
         #[arg(long)]

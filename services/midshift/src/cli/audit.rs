@@ -109,8 +109,8 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         .await
         .map(drop),
         Verb::Export { call, out: Some(path) } => export_to(&call, &path, out).await,
-        Verb::Verify { file: Some(path), head, .. } => told(&read(&path, &head)?, out),
-        Verb::Verify { call, file: None, head } => told(&verify(&call, head, out).await?, out),
+        Verb::Verify { file: Some(path), head, .. } => print_verification(&read(&path, &head)?, out),
+        Verb::Verify { call, file: None, head } => print_verification(&verify(&call, head, out).await?, out),
     }
 }
 
@@ -269,7 +269,7 @@ async fn verify(call: &Call, noted: Vec<Mark>, out: &Out) -> Result<v1::VerifyAu
 }
 
 /// Prints what came out. An error names the first row that shows that something was changed.
-fn told(answer: &v1::VerifyAuditResponse, out: &Out) -> Result<(), Exit> {
+fn print_verification(answer: &v1::VerifyAuditResponse, out: &Out) -> Result<(), Exit> {
     let head = |verdict: &v1::AuditVerdict| {
         verdict
             .head

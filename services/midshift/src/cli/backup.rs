@@ -52,7 +52,7 @@ pub struct Restore {
     verify: bool,
 }
 
-/// Copies.
+/// Copies everything durable of a server, and prints a summary of the copy.
 pub async fn take(args: &Take, out: &Out) -> Result<(), Exit> {
     let from = Places { data: args.data.clone(), ota_keys: args.ota_keys.clone(), store: args.database.postgres()? };
     let summary = backup::back_up(&from, &args.to, clock::clock(1000).now().wall).await?;

@@ -169,7 +169,7 @@ pub enum Verb {
         call: Call,
         /// As NAME-VERSION or by its SHA-256.
         bundle: String,
-        /// Why.
+        /// Why it is taken back, for the audit.
         #[arg(long)]
         reason: String,
         #[command(flatten)]

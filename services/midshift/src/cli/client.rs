@@ -455,11 +455,11 @@ impl Call {
     pub async fn task(&self) -> Result<TaskServiceClient<Line>, Exit> {
         Ok(TaskServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
     }
-    /// Fleet.
+    /// Connects to the service of fleet.
     pub async fn fleet(&self) -> Result<FleetServiceClient<Line>, Exit> {
         Ok(FleetServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
     }
-    /// Telemetry.
+    /// Connects to the service of telemetry.
     pub async fn telemetry(&self) -> Result<TelemetryServiceClient<Line>, Exit> {
         Ok(TelemetryServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
     }

@@ -18,7 +18,7 @@ pub enum Verb {
     Lift {
         #[command(flatten)]
         call: Call,
-        /// Whose.
+        /// The robot that may have it again.
         robot_id: String,
         /// As NAME-VERSION or by its SHA-256.
         bundle: String,

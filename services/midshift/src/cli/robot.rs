@@ -1,11 +1,12 @@
 //! `midshift robot …`
 
 mod adopt;
+mod software;
 mod table;
 
 pub use table::controls;
 
-use super::client::{Call, Change, Exit, ended, follow, unary};
+use super::client::{Call, Change, Exit, follow, unary};
 use super::enrol::{self, Machine};
 use super::explain::verdict;
 use super::lookup::{self, Found, whole_id};
@@ -16,7 +17,6 @@ use clap::Subcommand;
 use midshift_core::time::Utc;
 use midshift_proto::fleet::v1 as fleet;
 use midshift_proto::json;
-use midshift_proto::ota::v1 as ota;
 use midshift_proto::telemetry::v1;
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
@@ -48,7 +48,7 @@ pub enum Verb {
     Cordon {
         #[command(flatten)]
         one: One,
-        /// Why.
+        /// Why it gets no new work.
         #[arg(long)]
         reason: String,
         /// Only if it is still as this etag says.
@@ -97,7 +97,7 @@ pub enum Verb {
     Retire {
         #[command(flatten)]
         one: One,
-        /// Why.
+        /// Why it leaves the fleet.
         #[arg(long)]
         reason: String,
         /// Only if it is still as this etag says.
@@ -154,7 +154,7 @@ pub enum Verb {
     Pin {
         #[command(flatten)]
         one: One,
-        /// Why.
+        /// Why it is kept there, for the audit.
         #[arg(long)]
         reason: String,
         #[command(flatten)]
@@ -222,7 +222,7 @@ pub enum Verb {
         /// Of which roll-out.
         #[arg(long, value_name = "ROLLOUT_ID")]
         from: String,
-        /// Why.
+        /// Why it is left out, for the audit.
         #[arg(long, default_value = "")]
         reason: String,
         #[command(flatten)]
@@ -406,47 +406,9 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
             control(&answer.into_inner().control.unwrap_or_default(), out)?;
             Ok(())
         }
-        Verb::Pin { one, reason, change } => {
-            let only = change.only();
-            let request = ota::PinRobotRequest {
-                robot_id: one.robot_id.clone(),
-                reason,
-                request_id: change.request_id,
-                validate_only: change.dry_run,
-            };
-            let answer = one.call.rollouts().await?.pin_robot(unary(request)).await.map_err(Exit::with_facts)?;
-            let answer = answer.into_inner();
-            software(&answer.software.unwrap_or_default(), out)?;
-            ended(answer.done_before.as_ref(), only, &format!("midshift robot unpin {}", one.robot_id), out);
-            Ok(())
-        }
-        Verb::Unpin { one, change } => {
-            let only = change.only();
-            let request = ota::UnpinRobotRequest {
-                robot_id: one.robot_id,
-                request_id: change.request_id,
-                validate_only: change.dry_run,
-            };
-            let answer = one.call.rollouts().await?.unpin_robot(unary(request)).await.map_err(Exit::with_facts)?;
-            let answer = answer.into_inner();
-            software(&answer.software.unwrap_or_default(), out)?;
-            ended(answer.done_before.as_ref(), only, "", out);
-            Ok(())
-        }
-        Verb::Unstick { one, reason, change } => {
-            let only = change.only();
-            let request = ota::UnstickRobotRequest {
-                robot_id: one.robot_id.clone(),
-                reason,
-                request_id: change.request_id,
-                validate_only: change.dry_run,
-            };
-            let answer = one.call.rollouts().await?.unstick_robot(unary(request)).await.map_err(Exit::with_facts)?;
-            let answer = answer.into_inner();
-            software(&answer.software.unwrap_or_default(), out)?;
-            ended(answer.done_before.as_ref(), only, &format!("midshift robot get {}", one.robot_id), out);
-            Ok(())
-        }
+        Verb::Pin { one, reason, change } => software::pin(&one, reason, change, out).await,
+        Verb::Unpin { one, change } => software::unpin(&one, change, out).await,
+        Verb::Unstick { one, reason, change } => software::unstick(&one, reason, change, out).await,
         Verb::Exclude { one, from, reason, change } => {
             let from = rollout::find(&one.call, &from).await?;
             rollout::exclude(&one.call, from, one.robot_id, reason, change, out).await
@@ -469,25 +431,6 @@ fn relabeling(words: &[String]) -> Result<(BTreeMap<String, String>, Vec<String>
         }
     }
     Ok((labels, removed))
-}
-
-/// What a robot runs, in words.
-fn software(software: &ota::RobotSoftware, out: &Out) -> Result<(), Exit> {
-    let short = |bundle: &str| bundle.chars().take(12).collect::<String>();
-    out.one(software, &software.robot_id, || {
-        let or = |text: &str, none: &str| if text.is_empty() { none.to_owned() } else { short(text) };
-        let version = if software.version.is_empty() { "no version reported" } else { &software.version };
-        let keeps = or(&software.committed, "what it came with");
-        let mut text = format!("{}  runs {version}, keeps {keeps}", software.robot_id);
-        if !software.on_trial.is_empty() {
-            text += &format!(", tries {}", short(&software.on_trial));
-        }
-        match &software.pin {
-            Some(pin) => text + &format!("  pinned by {} ({})", plain(&pin.actor), plain(&pin.reason)),
-            None => text + "  not pinned",
-        }
-    })?;
-    Ok(())
 }
 
 fn control(control: &fleet::RobotControl, out: &Out) -> anyhow::Result<()> {
@@ -538,7 +481,7 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
                 out.line("another machine is attached under this name; it gets no work");
             }
             out.line(&control_line(&control));
-            software_lines(&robot).iter().for_each(|line| out.line(line));
+            software::lines(&robot).iter().for_each(|line| out.line(line));
         }
         Format::Name => out.line(&robot.robot_id),
         Format::Json | Format::Jsonl => {
@@ -546,39 +489,6 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
         }
     }
     Ok(())
-}
-
-/// The sets of software on a robot, and what speaks against believing it.
-fn software_lines(robot: &v1::Robot) -> Vec<String> {
-    let mut lines = Vec::new();
-    if robot.device_key_changed {
-        lines.push("another machine's key signed what it says it has installed: not believed".to_owned());
-    }
-    if !robot.other_device_key.is_empty() {
-        lines.push(format!(
-            "other key  {}: no software until `midshift robot replace {}`, or --accept-key with it",
-            robot.other_device_key, robot.robot_id
-        ));
-    }
-    let Some(installed) = &robot.installed else { return lines };
-    let role = |set: &str| match set {
-        _ if set == installed.running && set != installed.current => "on trial",
-        _ if set == installed.running => "runs",
-        _ if set == installed.current || set == installed.previous => "kept",
-        _ => "staged",
-    };
-    let words = |set: &str, version: &str| {
-        let name = if version.is_empty() { "what it came with" } else { version };
-        format!("software  {:<8}  {name}  {}", role(set), set.get(..12).unwrap_or(set))
-    };
-    for named in [&installed.running, &installed.current, &installed.previous] {
-        if !named.is_empty() && !installed.sets.iter().any(|s| s.set == *named) {
-            let line = words(named, "");
-            lines.extend((!lines.contains(&line)).then_some(line));
-        }
-    }
-    lines.extend(installed.sets.iter().map(|s| words(&s.set, &s.version)));
-    lines
 }
 
 /// What the robot says and what was decided about it, in one document.

@@ -33,7 +33,7 @@ pub enum Verb {
 pub struct FaultArgs {
     #[command(flatten)]
     call: Call,
-    /// Whose.
+    /// The simulated robot.
     robot_id: String,
     #[command(flatten)]
     what: What,

@@ -60,7 +60,7 @@ pub enum Verb {
     Cancel {
         #[command(flatten)]
         which: Which,
-        /// Why.
+        /// Why it is to end.
         #[arg(long)]
         reason: String,
         /// End the record at once; the robot stays kept until it reports.
@@ -76,10 +76,10 @@ pub enum Verb {
     Resolve {
         #[command(flatten)]
         which: Which,
-        /// How.
+        /// What is to become of it.
         #[arg(long = "as", value_enum)]
         resolution: As,
-        /// Why.
+        /// What you saw or did.
         #[arg(long)]
         reason: String,
         /// The etag you saw; without it the task is read first.

@@ -57,7 +57,7 @@ pub enum Verb {
     Revoke {
         #[command(flatten)]
         call: Call,
-        /// Which.
+        /// Its id, as `token ls` shows it.
         token_id: String,
     },
 }

@@ -20,7 +20,7 @@ pub enum Verb {
     Clear {
         #[command(flatten)]
         call: Call,
-        /// Which.
+        /// The place that is empty.
         place_id: String,
         /// What you saw.
         #[arg(long)]

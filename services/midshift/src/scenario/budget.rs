@@ -18,7 +18,7 @@ const LATELY: LinkDuration = LinkDuration::from_secs(5);
 /// What robots say that matters here.
 #[derive(Clone, Debug)]
 pub struct Said {
-    /// Who.
+    /// The robot that says it.
     pub robot_id: RobotId,
     /// When it was heard last.
     pub heard: LinkTime,

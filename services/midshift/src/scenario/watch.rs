@@ -27,13 +27,13 @@ const READ_WITHIN: Duration = Duration::from_secs(30);
 /// What is looked at.
 #[derive(Clone)]
 pub struct Sight {
-    /// Rows.
+    /// The store whose rows are read.
     pub store: Arc<dyn Store>,
     /// What robots say.
     pub board: Arc<LiveBoard<Live>>,
     /// Where they are.
     pub site: Arc<Site>,
-    /// When.
+    /// The clock that says when it was looked.
     pub clock: Arc<dyn Clock>,
 }
 

@@ -1,6 +1,6 @@
 //! Nothing that goes by age gets older than it may, on every engine, and positions are as precise as they may be.
 
-use super::oldest::{Oldest, look};
+use super::oldest::{Oldest, find_oldest};
 use super::{Turn, audit};
 use crate::postgres_server::PostgresServer;
 use midshift_core::fleet::rows::FleetMark;
@@ -152,11 +152,11 @@ impl World {
         let (store, frames, clock) = (self.store.as_ref(), self.frames.as_ref(), self.wall.as_ref());
         Turn { store, frames, clock, task: Some(&self.task) }.take(|_| true).await;
         for (writer, _) in Table::audits() {
-            audit::keep(store, clock, *writer).await.expect("kept");
+            audit::maintain_chain(store, clock, *writer).await.expect("kept");
         }
     }
     async fn ages(&self) -> Vec<Oldest> {
-        look(self.store.as_ref(), self.frames.as_ref(), self.wall.as_ref()).await.expect("read")
+        find_oldest(self.store.as_ref(), self.frames.as_ref(), self.wall.as_ref()).await.expect("read")
     }
     /// Every position that is kept, with how old it is.
     async fn positions(&self) -> Vec<(Vitals, u64)> {
@@ -243,13 +243,13 @@ fn every_place_that_goes_by_age_is_looked_at_or_has_its_reason() {
         let wall = Arc::new(Wall(AtomicI64::new(BEGIN)));
         let store = MemoryStore::new(site(), StoreId(Arc::from("memory")), wall.clone());
         let frames = MemoryFrames::new(wall.clone(), u64::MAX);
-        look(&store, &frames, wall.as_ref()).await.expect("read")
+        find_oldest(&store, &frames, wall.as_ref()).await.expect("read")
     });
     let by_age = privacy::KEPT.iter().filter(|kept| kept.age_max_ms().is_some()).map(|kept| kept.place.as_str());
     let looked_at: Vec<&str> = looked_at.iter().map(|o| o.place.as_str()).collect();
     let left: Vec<&str> = by_age.filter(|place| !looked_at.contains(place)).collect();
     assert_eq!(left, others);
-    assert_eq!(privacy::of(Table::FleetAudit), Retention::Year);
+    assert_eq!(privacy::retention_of(Table::FleetAudit), Retention::Year);
     assert!(looked_at.contains(&Place::Samples.as_str()));
 }
 

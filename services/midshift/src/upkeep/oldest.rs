@@ -13,7 +13,7 @@ use midshift_store::{Error, FrameLog, Query, Store};
 /// The oldest of one place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Oldest {
-    /// Where.
+    /// The place that was looked into.
     pub place: Place,
     /// What the place is there for.
     pub class: DataClass,
@@ -28,7 +28,7 @@ pub struct Oldest {
 ///
 /// # Errors
 /// If the store or the log of samples cannot be read.
-pub async fn look(store: &dyn Store, frames: &dyn FrameLog, clock: &dyn Clock) -> Result<Vec<Oldest>, Error> {
+pub async fn find_oldest(store: &dyn Store, frames: &dyn FrameLog, clock: &dyn Clock) -> Result<Vec<Oldest>, Error> {
     let (now, mut found) = (clock.now(), Vec::new());
     for kept in privacy::KEPT {
         if let (Some(age_max_ms), Some(class)) = (kept.age_max_ms(), kept.holds.first())
@@ -43,9 +43,9 @@ pub async fn look(store: &dyn Store, frames: &dyn FrameLog, clock: &dyn Clock) -
 /// The same as metrics: `midshift_oldest_row_seconds` and, beside it, `midshift_retention_seconds`.
 ///
 /// # Errors
-/// As [`look`].
-pub async fn tell(store: &dyn Store, frames: &dyn FrameLog, clock: &dyn Clock) -> Result<(), Error> {
-    for Oldest { place, class, age_ms, age_max_ms } in look(store, frames, clock).await? {
+/// As [`find_oldest`].
+pub async fn publish_ages(store: &dyn Store, frames: &dyn FrameLog, clock: &dyn Clock) -> Result<(), Error> {
+    for Oldest { place, class, age_ms, age_max_ms } in find_oldest(store, frames, clock).await? {
         let labels = [("class", class.as_str()), ("place", place.as_str())];
         metrics::gauge!("midshift_oldest_row_seconds", &labels).set(age_ms as f64 / 1_000.0);
         metrics::gauge!("midshift_retention_seconds", &labels).set(age_max_ms as f64 / 1_000.0);

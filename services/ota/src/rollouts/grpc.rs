@@ -7,9 +7,9 @@ use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{BundleId, RequestId, RobotId, RolloutId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal, Violations};
-use midshift_core::rollout::commands::{CheckOnly, Command, Taken, Verb};
 use midshift_core::rollout::dry_run::dry_run;
 use midshift_core::rollout::objects;
+use midshift_core::rollout::requests::{CheckOnly, Command, Taken, Verb};
 use midshift_core::rollout::rows::{Quarantine, Rollout};
 use midshift_core::rollout::view::View;
 use midshift_proto::access::caller;
@@ -71,6 +71,23 @@ struct About<'a> {
     rollout_id: &'a str,
     etag: &'a str,
     reason: &'a str,
+}
+
+/// What all calls about the software of one robot say, and every rule that the call breaks.
+struct RobotCall {
+    robot_id: Option<RobotId>,
+    request_id: Option<String>,
+    check_only: CheckOnly,
+    bad: Violations,
+}
+
+impl RobotCall {
+    fn read(robot_id: &str, client_request_id: &str, validate_only: bool) -> Self {
+        let mut bad = Violations::default();
+        let robot_id = bad.take("robot_id", RobotId::parse(robot_id));
+        let request_id = request_id(client_request_id, &mut bad);
+        Self { robot_id, request_id, check_only: check_only(validate_only), bad }
+    }
 }
 
 impl RolloutService {
@@ -259,46 +276,41 @@ impl RolloutService {
         .await
     }
 
-    async fn software_of(&self, robot_id: RobotId) -> Result<Option<v1::RobotSoftware>, Refusal> {
-        self.look(move |view: &View, _, _| Some(encode::software(&view.software_of(&robot_id)))).await
+    /// Carries out a command about the software of one robot. Answers with what the robot runs after it, and when it was done before.
+    async fn act_on_robot(
+        &self,
+        call: RobotCall,
+        by: &Caller,
+        command: impl FnOnce(RobotId) -> Command,
+    ) -> Result<(Option<v1::RobotSoftware>, Option<prost_types::Timestamp>), Refusal> {
+        call.bad.finish()?;
+        let robot_id = call.robot_id.ok_or_else(internal)?;
+        let command = command(robot_id.clone());
+        let taken = self.act_once(command, by, None, call.check_only, call.request_id).await?;
+        let software = self.look(move |view: &View, _, _| encode::software(&view.software_of(&robot_id))).await?;
+        Ok((Some(software), done_before(taken)))
     }
 
     async fn pin(&self, r: v1::PinRobotRequest, by: &Caller) -> Result<v1::PinRobotResponse, Refusal> {
-        let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
-        let request_id = request_id(&r.request_id, &mut bad);
-        required_reason(&r.reason, &mut bad);
-        bad.finish()?;
-        let robot_id = robot_id.ok_or_else(internal)?;
-        let command = Command::Pin { robot_id: robot_id.clone(), reason: r.reason };
-        let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
-        let software = self.software_of(robot_id).await?;
-        Ok(v1::PinRobotResponse { software, done_before: done_before(taken) })
+        let mut call = RobotCall::read(&r.robot_id, &r.request_id, r.validate_only);
+        required_reason(&r.reason, &mut call.bad);
+        let command = |robot_id| Command::Pin { robot_id, reason: r.reason };
+        let (software, done_before) = self.act_on_robot(call, by, command).await?;
+        Ok(v1::PinRobotResponse { software, done_before })
     }
 
     async fn unpin(&self, r: v1::UnpinRobotRequest, by: &Caller) -> Result<v1::UnpinRobotResponse, Refusal> {
-        let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
-        let request_id = request_id(&r.request_id, &mut bad);
-        bad.finish()?;
-        let robot_id = robot_id.ok_or_else(internal)?;
-        let command = Command::Unpin { robot_id: robot_id.clone() };
-        let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
-        let software = self.software_of(robot_id).await?;
-        Ok(v1::UnpinRobotResponse { software, done_before: done_before(taken) })
+        let call = RobotCall::read(&r.robot_id, &r.request_id, r.validate_only);
+        let (software, done_before) = self.act_on_robot(call, by, |robot_id| Command::Unpin { robot_id }).await?;
+        Ok(v1::UnpinRobotResponse { software, done_before })
     }
 
     async fn unstick(&self, r: v1::UnstickRobotRequest, by: &Caller) -> Result<v1::UnstickRobotResponse, Refusal> {
-        let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
-        let request_id = request_id(&r.request_id, &mut bad);
-        required_reason(&r.reason, &mut bad);
-        bad.finish()?;
-        let robot_id = robot_id.ok_or_else(internal)?;
-        let command = Command::Unstick { robot_id: robot_id.clone(), reason: r.reason };
-        let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
-        let software = self.software_of(robot_id).await?;
-        Ok(v1::UnstickRobotResponse { software, done_before: done_before(taken) })
+        let mut call = RobotCall::read(&r.robot_id, &r.request_id, r.validate_only);
+        required_reason(&r.reason, &mut call.bad);
+        let command = |robot_id| Command::Unstick { robot_id, reason: r.reason };
+        let (software, done_before) = self.act_on_robot(call, by, command).await?;
+        Ok(v1::UnstickRobotResponse { software, done_before })
     }
 
     async fn accept_key(
@@ -306,18 +318,13 @@ impl RolloutService {
         r: v1::AcceptDeviceKeyRequest,
         by: &Caller,
     ) -> Result<v1::AcceptDeviceKeyResponse, Refusal> {
-        let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
-        let request_id = request_id(&r.request_id, &mut bad);
+        let mut call = RobotCall::read(&r.robot_id, &r.request_id, r.validate_only);
         if r.device_key.len() != 64 || !r.device_key.chars().all(|c| matches!(c, '0'..='9' | 'a'..='f')) {
-            bad.add("device_key", "must be 64 lower-case hexadecimal digits");
+            call.bad.add("device_key", "must be 64 lower-case hexadecimal digits");
         }
-        bad.finish()?;
-        let robot_id = robot_id.ok_or_else(internal)?;
-        let command = Command::AcceptKey { robot_id: robot_id.clone(), device_key: r.device_key };
-        let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
-        let software = self.software_of(robot_id).await?;
-        Ok(v1::AcceptDeviceKeyResponse { software, done_before: done_before(taken) })
+        let command = |robot_id| Command::AcceptKey { robot_id, device_key: r.device_key };
+        let (software, done_before) = self.act_on_robot(call, by, command).await?;
+        Ok(v1::AcceptDeviceKeyResponse { software, done_before })
     }
 
     async fn software(

@@ -23,7 +23,7 @@ use midshift_core::ids::RolloutId;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::bugs::Bugs;
-use midshift_core::rollout::commands::{Ask, CheckOnly, Command, Taken};
+use midshift_core::rollout::requests::{Ask, CheckOnly, Command, Taken};
 use midshift_core::rollout::spec::PROBATION_DEFAULT_MS;
 use midshift_core::rollout::view::View;
 use midshift_core::rows::{Revision, Seq};
@@ -48,7 +48,7 @@ pub struct Parts {
     pub board: Arc<LiveBoard<Live>>,
     /// The site.
     pub site: Arc<Site>,
-    /// Clocks.
+    /// Where the time of the wall, the link and the site is read.
     pub clock: Arc<dyn Clock>,
     /// Releases and keys.
     pub ota: OtaService,

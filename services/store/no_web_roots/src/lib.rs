@@ -2,5 +2,5 @@
 
 use pki_types::TrustAnchor;
 
-/// None.
+/// No root at all.
 pub const TLS_SERVER_ROOTS: &[TrustAnchor<'static>] = &[];

@@ -53,7 +53,7 @@ fn verified(lines: &[String], noted: &[Mark]) -> Result<(), Exit> {
     let path = dir.path().join("audit.jsonl");
     std::fs::write(&path, lines.iter().map(|line| format!("{line}\n")).collect::<String>())
         .unwrap_or_else(|e| panic!("{e}"));
-    told(&read(&path, noted)?, &Out::new(Format::Name))
+    print_verification(&read(&path, noted)?, &Out::new(Format::Name))
 }
 
 fn broken(lines: &[String], noted: &[Mark]) -> String {

@@ -1,7 +1,6 @@
 //! What can be said of the machine that `doctor` runs on, and of a data folder on it.
 
 use super::Finding;
-use crate::serve::IDENTITY;
 use crate::stop;
 use midshift_core::limits;
 use std::collections::BTreeSet;
@@ -87,7 +86,7 @@ pub fn data(folder: &Path) -> Vec<Finding> {
         return vec![Finding::good("disk", text)];
     }
     let mut found = vec![disk(folder)];
-    let private = [folder.to_owned(), folder.join(IDENTITY), folder.join(stop::FOLDER)];
+    let private = [folder.to_owned(), folder.join(midshift_identity::FOLDER), folder.join(stop::FOLDER)];
     let open: Vec<String> = private.iter().filter_map(|folder| is_open(folder)).collect();
     found.push(match open.is_empty() {
         true => Finding::good("exposure", format!("{} is for its owner alone", folder.display())),
@@ -173,7 +172,7 @@ mod tests {
         let open = |path: &Path, mode| fs::set_permissions(path, fs::Permissions::from_mode(mode)).expect("a mode");
         open(folder.path(), 0o700);
         assert!(told().good, "{}", told().text);
-        let keys = folder.path().join(IDENTITY);
+        let keys = folder.path().join(midshift_identity::FOLDER);
         fs::create_dir(&keys).expect("a folder");
         open(&keys, 0o755);
         assert!(!told().good && told().text.contains("identity has mode 755"), "{}", told().text);

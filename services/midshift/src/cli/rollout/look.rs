@@ -238,7 +238,7 @@ pub struct Event {
     pub time: Timestamp,
     /// What, in one word.
     pub what: &'static str,
-    /// Told.
+    /// What happened, in a line for people.
     pub text: String,
 }
 

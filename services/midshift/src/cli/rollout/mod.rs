@@ -70,9 +70,9 @@ pub enum Verb {
     Exclude {
         #[command(flatten)]
         one: One,
-        /// Whom.
+        /// The robot that is left out.
         robot_id: String,
-        /// Why.
+        /// Why it is left out, for the audit.
         #[arg(long, default_value = "")]
         reason: String,
         #[command(flatten)]
@@ -82,9 +82,9 @@ pub enum Verb {
     Lost {
         #[command(flatten)]
         one: One,
-        /// Whom.
+        /// The robot that will not come back.
         robot_id: String,
-        /// Why.
+        /// Why it is given up, for the audit.
         #[arg(long)]
         reason: String,
         #[command(flatten)]

@@ -29,7 +29,7 @@ pub struct Resume {
     robot: Vec<String>,
     /// These tasks, each by its id or a prefix that only one task has.
     task_ids: Vec<String>,
-    /// Why.
+    /// Why they may go on.
     #[arg(long)]
     reason: String,
     #[command(flatten)]
