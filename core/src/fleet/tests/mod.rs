@@ -9,6 +9,7 @@ mod labels;
 mod lasting;
 mod maps;
 mod misreads;
+mod opened;
 mod order;
 mod unexplained;
 
