@@ -10,6 +10,7 @@ use midshift_agent::sets::Sets;
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::store::Op;
 use midshift_agent::switch::{FACTORY, Switch};
+use midshift_agent::update::proven::Proven;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::Migration;
 use midshift_core::reason::Code;
@@ -362,4 +363,21 @@ fn documents_are_kept_of_what_may_run_and_of_no_more() {
     let name = name_of(&rig);
     releases.cut(true);
     runs_and_works(rig, &name);
+}
+
+#[test]
+fn a_set_counts_only_with_its_documents_and_what_stands_in_them() {
+    let (rig, releases) = connected();
+    let rig = committed(rig, &releases, &releases.release("1.1.0"), 1);
+    let proven = rig.store.kept().expect("loaded").ledger.proven.expect("was written");
+    let good = proven.sets.values().next().expect("one set").clone();
+    assert_eq!(proven.check(&good), Ok(()));
+    let mut without = Proven::clone(&proven);
+    without.releases.clear();
+    assert!(without.check(&good).is_err(), "its documents are gone");
+    let forged = set("6.6.6", b"forged program", b"forged settings");
+    let mut with = Proven::clone(&proven);
+    assert!(with.check(&forged).is_err(), "no such set was staged");
+    with.sets.insert(forged.id(), forged.clone());
+    assert!(with.check(&forged).is_err(), "what is in it stands in no document");
 }
