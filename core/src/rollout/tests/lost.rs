@@ -93,6 +93,22 @@ fn a_robot_that_was_written_off_counts_again_when_it_is_heard() {
 }
 
 #[test]
+fn a_robot_that_was_written_off_counts_in_its_area_before_its_roll_out_has_looked_again() {
+    let (mut rig, first) = silent(|s| s.writes_off_lost = true);
+    rig.until(80, |r| r.of("ro", first).lost.is_some());
+    rig.ticks(1);
+    let counts = |rig: &Rig| {
+        let row: fleet::rows::AreaBudget = rig.row("hall").expect("a row");
+        row.off_work.contains(&robot_id(first))
+    };
+    assert!(!counts(&rig), "it is not heard");
+    rig.robots[first].is_off = false;
+    rig.pass(1_000);
+    rig.fleet_turn();
+    assert!(counts(&rig));
+}
+
+#[test]
 fn who_holds_the_place_in_a_wave_is_named_too() {
     let (mut rig, first) = silent(|s| s.max_in_flight = Some(1));
     rig.ticks(2);
