@@ -7,7 +7,7 @@
 //! who is killed and when; `MIDSHIFT_NIGHT=all` plays the whole night instead of a short one.
 
 use crate::harness::{Server, folder, in_states, until};
-use crate::identity::incidents;
+use crate::identity::{incidents, json};
 use crate::kill::{all_over, judge_each, submit};
 use crate::proxy::Proxy;
 use crate::robots::{enrolment, remembered};
@@ -15,17 +15,19 @@ use crate::rolled_out::{Robot, begin_rollout, call, done, until_known};
 use anyhow::{Context, ensure};
 use midshift::clock::clock;
 use midshift_agent::switch::FACTORY;
+use midshift_core::ids::RobotId;
 use midshift_core::reason::Code;
 use midshift_core::site::{DEMO, text};
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::ota::v1::{ListRolloutRobotsRequest, RolloutRobot, RolloutStep};
 use midshift_proto::task::v1::TaskState;
 use midshift_sim::body::MODEL;
-use midshift_sim::journal::{self, Effect};
+use midshift_sim::journal::{self, Effect, Entry, Journal};
 use midshift_sim::swarm::AGENT_FILE;
 use rand::rngs::StdRng;
 use rand::seq::{IndexedRandom, SliceRandom};
 use rand::{RngExt, SeedableRng};
+use serde_json::Value;
 use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -535,7 +537,29 @@ impl Night {
         let rows = until("its robots", LIMIT, async || self.rows(id).await).await?;
         let is_given_up = |row: &RolloutRobot| row.robot_id == robot && row.written_off.is_some();
         ensure!(rows.iter().any(is_given_up), "{robot} holds others up: {rows:?}");
-        Ok(())
+        self.carry_away(nth).await
+    }
+    /// People carry the silent robot off the floor, and open the places that the site kept for it.
+    async fn carry_away(&mut self, nth: usize) -> anyhow::Result<()> {
+        let post = &mut self.posts[nth];
+        post.robot.end()?;
+        leave_places(&post.journal(), &post.id)?;
+        let (id, address) = (post.id.clone(), self.server.address);
+        until("nothing to be kept for who is away", LIMIT, async || {
+            let zones = json(address, &["zone", "ls", "--in-use"])?;
+            let zones = zones["places"].as_array().cloned().unwrap_or_default();
+            let holds = |zone: &Value| {
+                zone["holders"].as_array().is_some_and(|all| all.iter().any(|h| h["robotId"] == id.as_str()))
+            };
+            let kept: Vec<&Value> = zones.iter().filter(|zone| holds(zone)).collect();
+            for zone in &kept {
+                let [place, etag] = ["placeId", "etag"].map(|field| zone[field].as_str().unwrap_or_default());
+                let clear = ["zone", "clear", place, "--reason", "carried away", "--if-match", etag, "--server"];
+                call(&[&clear[..], &[&self.address]].concat())?;
+            }
+            Ok(kept.is_empty().then_some(()))
+        })
+        .await
     }
     /// The good release, in the middle of which all the rest happens.
     async fn good(&mut self) -> anyhow::Result<()> {
@@ -609,6 +633,26 @@ impl Night {
         }
         Ok(())
     }
+}
+
+/// The body of this journal is in no place any more.
+fn leave_places(path: &Path, robot: &str) -> anyhow::Result<()> {
+    let (mut inside, entries) = (BTreeSet::new(), journal::read(path)?);
+    for entry in &entries {
+        match &entry.effect {
+            Effect::Entered { place_id } => drop(inside.insert(place_id.clone())),
+            Effect::Left { place_id } => drop(inside.remove(place_id)),
+            _ => {}
+        }
+    }
+    let mut journal = Journal::open(path)?;
+    for place_id in inside {
+        let (utc_ms, robot_id) = (now_ms(), Some(RobotId::parse(robot)?));
+        let site_ms = entries.last().map_or(0, |entry| entry.site_ms);
+        journal.append(Entry { utc_ms, site_ms, robot_id, effect: Effect::Left { place_id } });
+    }
+    ensure!(journal.lost() == 0, "{} cannot be written", path.display());
+    Ok(())
 }
 
 async fn played(dir: &Path, plot: &'static Plot, seed: u64) -> anyhow::Result<()> {

@@ -88,6 +88,11 @@ impl Robot {
     pub fn kill_launcher(&mut self) -> anyhow::Result<()> {
         self.running.kill()
     }
+    /// SIGKILL to the launcher and its agent.
+    pub fn end(&mut self) -> anyhow::Result<()> {
+        self.running.signal_group("KILL")?;
+        self.running.kill()
+    }
     /// Process id of the agent; none: the launcher is about to start it.
     pub fn agent(&self) -> anyhow::Result<Option<u32>> {
         let launcher = self.running.id();

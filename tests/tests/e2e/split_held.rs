@@ -23,8 +23,8 @@ const ROBOT: &str = "rbt-01";
 const PINNED: &str = "rbt-02";
 /// Areas of the site.
 const AREAS: [&str; 3] = ["hall", "packing", "quality"];
-/// Of the shared data folder: since when the processes of before doubted their clock, unix ms.
-const DOUBTED: &str = "clock-doubted";
+/// Of the shared data folder: the newest time that the processes of before did not doubt, unix ms.
+const BELIEVED: &str = "clock-believed";
 /// So long before a start that the start is doubted, milliseconds: 8 days.
 const OFF_MS: i64 = 8 * 24 * 3_600_000;
 /// There where the network has set the clock of this machine: then no start is doubted.
@@ -70,7 +70,7 @@ fn began(journal: &Path, version: &str) -> anyhow::Result<Option<i64>> {
 async fn a_clock_in_doubt(stack: &mut Stack, data: &Path) -> anyhow::Result<()> {
     let (public, data_folder) = (stack.public.to_string(), data.display().to_string());
     stack.kill_all()?;
-    std::fs::write(data.join(DOUBTED), (wall().0 - OFF_MS).to_string())?;
+    std::fs::write(data.join(BELIEVED), (wall().0 - OFF_MS).to_string())?;
     stack.restart_all().await?;
     if Path::new(SYNCED).exists() {
         say!("the network has set the clock here: nothing is doubted");
