@@ -2,8 +2,8 @@
 //!
 //! 1. Every standing place of a goto that the attempt had to do must have been entered by its robot since it has the attempt, by its own
 //!    word: in order, since what it says of places and of attempts comes in one lane. Where it stood already counts.
-//! 2. An event that says more waits for the next heartbeat that counts. If that says the same, the task asks a person, and the robot gets no
-//!    work until a person has closed its incident.
+//! 2. An event that says it is done without that waits for the next heartbeat that counts. If that says the same, the task asks a person,
+//!    and the robot gets no work until a person has closed its incident.
 //! 3. What cannot be decided is believed: an event was lost, the robot writes in another ring, the map has changed, the store turned out to
 //!    be older than the robot, a person cleared the place, or an older version began the attempt.
 //!
@@ -27,7 +27,7 @@ fn goal<'s>(site: &'s Site, step: &WorkStep) -> Option<&'s PlaceId> {
     Some(&site.place(at).place_id)
 }
 
-/// The robot is or was inside of the place, or a person says that nobody can tell: noted, if its attempt has a step there.
+/// The robot is or was inside of the place, or a person cleared it of the robot: that is noted if its attempt has a step there.
 pub fn note(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId) {
     let Some(a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)) else { return };
     let is_known = a.been.as_ref().is_none_or(|been| been.places.contains(place_id));
@@ -44,7 +44,7 @@ pub fn note(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId) {
     tx.put(a, "attempt.changed");
 }
 
-/// Its heartbeat says at which waypoint the robot is.
+/// Takes from a heartbeat at which waypoint the robot is.
 pub fn note_standing(tx: &mut Tx, live: &Live) {
     let site = tx.view.site.clone();
     let at = live.report.vitals.waypoint.as_ref().and_then(|waypoint| site.find(waypoint));
@@ -102,16 +102,17 @@ pub fn unseen(view: &View, now: &Now, robot_id: &RobotId, report: &AttemptReport
 
 /// Standing places that the attempt had to reach. Once it is taken back nobody knows where it began: then the last of them.
 fn goals<'v>(view: &'v View, a: &Attempt) -> Option<Vec<&'v PlaceId>> {
+    let site: &Site = &view.site;
     let given = view.desired_work.get(a.robot_id.as_str()).and_then(|d| d.row.assignment.as_ref());
     if let Some(given) = given.filter(|given| given.attempt == a.attempt) {
         let begun_at = given.route.first().and_then(|point| point.standing.as_ref());
         let due = given.steps.iter().enumerate().filter(|(step, _)| is_due(given, *step as u32)).map(|(_, step)| step);
-        let due = due.filter(|step| !step.continue_on_fail).filter_map(|step| goal(&view.site, step));
+        let due = due.filter(|step| !step.continue_on_fail).filter_map(|step| goal(site, step));
         return Some(due.filter(|place| begun_at != Some(*place)).collect());
     }
     let steps = &view.intake(a.attempt.subject.task_id()?)?.spec.steps;
     let last = steps.iter().rfind(|step| matches!(step.kind, StepKind::Goto { .. }))?;
-    Some(goal(&view.site, last).filter(|_| !last.continue_on_fail).into_iter().collect())
+    Some(goal(site, last).filter(|_| !last.continue_on_fail).into_iter().collect())
 }
 
 /// The attempt does this step itself.
