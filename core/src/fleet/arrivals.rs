@@ -5,7 +5,7 @@
 //! 2. An event that says it is done without that waits for the next heartbeat that counts. If that says the same, the task asks a person,
 //!    and the robot gets no work until a person has closed its incident.
 //! 3. What cannot be decided is believed: an event was lost, the robot writes in another ring, the map has changed, the store turned out to
-//!    be older than the robot, a person cleared the place, or an older version began the attempt.
+//!    be older than the robot, a person cleared the place, its row cannot be read, or an older version began the attempt.
 //!
 //! Called by `inbox` for events, by `repair` for heartbeats, and by `screen`. Invariant: nothing here frees a place or moves a task forward.
 
@@ -96,7 +96,7 @@ pub fn unseen(view: &View, now: &Now, robot_id: &RobotId, report: &AttemptReport
     if *ring != been.ring || claims::is_ahead(view, robot_id, now) {
         return None;
     }
-    let is_unseen = |place: &&PlaceId| !been.places.contains(*place) && !stands_in(view, robot_id, place);
+    let is_unseen = |place: &&PlaceId| !been.places.contains(*place) && is_elsewhere(view, robot_id, place);
     goals(view, a)?.into_iter().find(is_unseen).cloned()
 }
 
@@ -120,9 +120,10 @@ fn is_due(given: &Assignment, step: u32) -> bool {
     step == given.from_step || step >= given.resume_step
 }
 
-fn stands_in(view: &View, robot_id: &RobotId, place_id: &PlaceId) -> bool {
-    let holder = view.places.get(place_id.as_str()).and_then(|place| place.row.holder(robot_id));
-    holder.is_some_and(|holder| holder.state == HolderState::Inside)
+/// The row of the place says that the robot is not inside of it now. One that this build cannot read says nothing.
+fn is_elsewhere(view: &View, robot_id: &RobotId, place_id: &PlaceId) -> bool {
+    let place = view.places.get(place_id.as_str()).map(|place| &place.row);
+    place.is_some_and(|place| place.holder(robot_id).is_none_or(|holder| holder.state != HolderState::Inside))
 }
 
 /// An event says that the work is done and its robot was not seen there: the next heartbeat tells. What the event adds is taken.
