@@ -227,6 +227,8 @@ codes! {
     RobotNotUnderstood = "ROBOT_NOT_UNDERSTOOD", "The robot dials and is refused each time, since what it says breaks the robot protocol. It closes by itself."
         => "Its maker must mend what the reason names.";
     ReportImplausible = "REPORT_IMPLAUSIBLE", "The robot reported a step or an end that cannot be. It frees nothing and moves nothing forward; the robot gets no work while it says so. Look at the robot's software.";
+    GoalNotEntered = "GOAL_NOT_ENTERED", "The robot said that a task was done and was never seen at a place where it had to be for that. The task waits for a person, and the robot gets no work until the incident is closed."
+        => "Look where the item is, then `midshift task resolve TASK`; look at the robot, then `midshift incident close INCIDENT --reason TEXT`.";
     RobotDoesNotAnswer = "ROBOT_DOES_NOT_ANSWER", "The robot heard three offers within ten minutes and answered none, or refused five in a row. It gets one offer after ten minutes; if it takes that, this ends. Look at its software.";
     OffersNotAnswered = "OFFERS_NOT_ANSWERED", "Many robots did not answer offers at the same time, so none of them is blamed. Look at the server and its network.";
     AttemptUnknown = "ATTEMPT_UNKNOWN", "The robot has an attempt that this server does not know, and does not let it go. Look at the robot; once it stands still, `midshift robot disown ROBOT ATTEMPT` lets the server ignore it.";

@@ -209,6 +209,7 @@ impl OldSite {
             refusal: None,
             stats: WorkStats::default(),
             software: "1.0.0".to_owned(),
+            been: None,
         }
     }
 

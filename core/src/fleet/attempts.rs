@@ -4,7 +4,7 @@ use super::Tx;
 use super::rows::{RobotAuthority, RobotHolder};
 use super::view::View;
 use crate::ids::{AttemptId, RobotId};
-use crate::task::state::Errand;
+use crate::task::state::{Been, Errand};
 use crate::task::{Attempt, AttemptPhase};
 use crate::time::SiteDuration;
 use crate::work::{Effect, StepKind, WorkStats, WorkStep};
@@ -41,8 +41,10 @@ pub fn steps(view: &View, a: &Attempt) -> Vec<WorkStep> {
 
 /// A new attempt of a robot, not yet written.
 pub fn fresh_attempt(tx: &Tx, attempt: AttemptId, robot_id: &RobotId, offer: crate::authority::Authority) -> Attempt {
-    let software =
-        tx.view.sessions.get(robot_id.as_str()).map(|s| s.row.inventory.software.clone()).unwrap_or_default();
+    let session = tx.view.sessions.get(robot_id.as_str()).map(|s| &s.row);
+    let software = session.map(|s| s.inventory.software.clone()).unwrap_or_default();
+    let of_task = session.filter(|_| attempt.subject.task_id().is_some());
+    let been = of_task.map(|s| Been { ring: s.ring.clone(), ..Been::default() });
     Attempt {
         attempt,
         robot_id: robot_id.clone(),
@@ -61,6 +63,7 @@ pub fn fresh_attempt(tx: &Tx, attempt: AttemptId, robot_id: &RobotId, offer: cra
         refusal: None,
         stats: WorkStats::default(),
         software,
+        been,
     }
 }
 

@@ -31,6 +31,8 @@ crate::seeded_bugs! {
     HoldsComeAtOnce holds_come_at_once;
     /// Each word of a robot that people are told of opens an incident of its own.
     EachWordIsTold each_word_is_told;
+    /// A robot that says that its work is done was where that is done.
+    SuccessIsBelieved success_is_believed;
     /// After a report that counts for nothing everything is read anew.
     FencedReportsRebuild fenced_reports_rebuild;
 }

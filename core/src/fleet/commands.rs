@@ -5,7 +5,7 @@ use super::Tx;
 pub use super::asked::Command;
 use super::rows::{Cordon, HolderState, Place, PlaceHolder, RobotControl};
 use super::view::View;
-use super::{Board, drain, heard, incidents, load};
+use super::{Board, arrivals, drain, heard, incidents, load};
 use crate::audit::{self, Note};
 use crate::identity::Caller;
 use crate::ids::{AttemptId, RobotId};
@@ -109,6 +109,9 @@ fn may_clear(board: &Board, now: &Now, place: &Place) -> Result<(), Refusal> {
 fn clear(tx: &mut Tx, board: &Board, place: Place) {
     let now = tx.now;
     let (kept, gone): (Vec<_>, Vec<_>) = place.holders.into_iter().partition(|h| may_be_there(board, &now, h));
+    for holder in &gone {
+        arrivals::note(tx, &holder.robot_id, &place.place_id);
+    }
     let mut cleared = place.cleared;
     cleared.extend(gone.iter().map(|holder| holder.grant_id).filter(|id| *id != 0));
     cleared.drain(..cleared.len().saturating_sub(limits::CLAIMED_PLACES_MAX));

@@ -6,10 +6,10 @@ use super::Tx;
 use super::rows::{HoldToken, HolderState, RobotControl};
 use super::tasks::{News, event_of, happen};
 use super::view::View;
-use super::{Board, Tally, answers, breaker, claims, errands, incidents, plausible, tasks};
+use super::{Board, Tally, answers, arrivals, breaker, claims, errands, incidents, plausible, tasks};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::{Code, Reason};
-use crate::robot::{HardwareStop, Load, Mode};
+use crate::robot::{HardwareStop, Lane, Load, Mode};
 use crate::task::{AttemptPhase, Event};
 use crate::work::{
     AttemptReport, InboxEntry, InboxItem, PlaceNews, RobotEvent, SampleBody, UNREADABLE_WORK, WorkState,
@@ -17,10 +17,18 @@ use crate::work::{
 
 /// Obeys one entry of the robot inbox.
 pub fn take(tx: &mut Tx, entry: &InboxEntry, board: &Board, tally: &mut Tally) {
-    let InboxItem::Sample(sample) = &entry.what else { return };
-    let SampleBody::Event(event) = &sample.body else { return };
     let robot_id = &entry.robot_id;
+    let InboxItem::Sample(sample) = &entry.what else {
+        if entry.lane == Lane::Event {
+            arrivals::lost(tx, robot_id);
+        }
+        return;
+    };
+    let SampleBody::Event(event) = &sample.body else { return };
     match event {
+        RobotEvent::Attempt(report) if arrivals::unseen(tx.view, &tx.now, robot_id, report).is_some() => {
+            arrivals::wait(tx, report);
+        }
         RobotEvent::Attempt(report) => {
             breaker::count_let_go(tx, robot_id, report);
             if calls_offer_over(tx.view, robot_id, report) {
@@ -31,6 +39,7 @@ pub fn take(tx: &mut Tx, entry: &InboxEntry, board: &Board, tally: &mut Tally) {
         RobotEvent::Place { place_id, grant_id, news: PlaceNews::Entered }
             if claims::waits_for_heartbeat(tx.view, board, robot_id, place_id) =>
         {
+            arrivals::note(tx, robot_id, place_id);
             claims::check_grant(tx, robot_id, place_id, *grant_id);
         }
         RobotEvent::Place { place_id, grant_id, news } => place(tx, robot_id, place_id, *grant_id, *news),
@@ -105,7 +114,7 @@ pub fn carries(tx: &mut Tx, robot_id: &RobotId, load: &Load) {
 }
 
 /// A robot that was kept for an attempt the record had let go reports its end: it is free again.
-fn release(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
+pub(super) fn release(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
     if tx.view.held_by(robot_id) != Some(&report.attempt) {
         return;
     }
@@ -121,6 +130,10 @@ fn release(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
 /// Obeys news of a place.
 pub fn place(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64, news: PlaceNews) {
     let Some(mut place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
+    let was_inside = place.holder(robot_id).is_some_and(|holder| holder.state == HolderState::Inside);
+    if was_inside || news == PlaceNews::Entered {
+        arrivals::note(tx, robot_id, place_id);
+    }
     let Some(at) = place.holders.iter().position(|h| h.robot_id == *robot_id && h.grant_id == grant_id) else {
         if news == PlaceNews::Entered {
             claims::take_over(tx, robot_id, place_id, grant_id);

@@ -1,12 +1,13 @@
 //! The law of the fleet: who gets which task, who may enter which place, what a heartbeat repairs, and why not now.
 //!
 //! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
-//! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `plausible`, `claims`, `answers`, `commands` (`asked`: which there are) are what happens; `tasks` moves tasks by
+//! Rooms: `rows` and `view` are what is known; `inbox`, `requests`, `timers`, `repair`, `plausible`, `claims`, `arrivals`, `answers`, `commands` (`asked`: which there are) are what happens; `tasks` moves tasks by
 //! the table and `breaker` counts what robots fail; `heard`, `anchor`, `attempts`, `incidents` and `refused` are what they share; `queue`, `screen`, `pool` and `assign` give work, in turns cut by `slice`; `stops` and `stopped` keep it from who is stopped; `starts` keeps places for robots that are to come; `errands`, `drain`, `budget`, `places`, `desired`, `way` bring robots where they belong; `standing` says what is done or waited for, `explain` tells people, `unexplained` counts what nobody can say, `lasting` opens incidents of robots that stand for long, `closures` of places that are closed; `maps` says what a changed map waits for.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod anchor;
 pub mod answers;
+pub mod arrivals;
 pub mod asked;
 pub mod assign;
 pub mod attempts;
@@ -180,6 +181,7 @@ pub fn absorb(view: &mut View, now: Now, board: &Board, entries: &[Entry], plan:
         }
         if view.unusable.contains(&entry.seq) {
             plan.decide(view, now, "fleet", |tx| pass_over(tx, entry));
+            lose_word(view, now, entry, plan);
             continue;
         }
         match (entry.log, entry.table, &entry.body) {
@@ -193,9 +195,13 @@ pub fn absorb(view: &mut View, now: Now, board: &Board, entries: &[Entry], plan:
                     plan.report.tally = tally;
                     if !is_obeyed {
                         plan.decide(view, now, "fleet", |tx| pass_over(tx, entry));
+                        lose_word(view, now, entry, plan);
                     }
                 }
-                Err(error) => plan.report.unreadable.push(format!("inbox {}: {error}", entry.seq.0)),
+                Err(error) => {
+                    plan.report.unreadable.push(format!("inbox {}: {error}", entry.seq.0));
+                    lose_word(view, now, entry, plan);
+                }
             },
             (Log::Task, Some(Table::TaskRequest), Some(body)) => match serde_json::from_str::<TaskRequest>(body) {
                 Ok(request) => {
@@ -299,6 +305,13 @@ fn pass_over(tx: &mut Tx, entry: &Entry) {
     mark(tx, entry.seq);
 }
 
+/// An entry of the inbox that is not obeyed may have said where its robot was.
+fn lose_word(view: &mut View, now: Now, entry: &Entry, plan: &mut Plan) {
+    if let Some(robot_id) = RobotId::parse(&entry.subject).ok().filter(|_| entry.log == Log::RobotInbox) {
+        plan.decide(view, now, "fleet", |tx| arrivals::lost(tx, &robot_id));
+    }
+}
+
 /// The entry of the feed that an item obeys: the mark it writes.
 pub fn obeyed(item: &Item) -> Option<Seq> {
     crate::picture::written::<FleetMark>(item).map(|mark| mark.seq)
@@ -344,6 +357,9 @@ fn mark(tx: &mut Tx, seq: Seq) {
 pub fn found(view: &mut View, now: Now, site_text: &str, map: &maps::MapChange, plan: &mut Plan) {
     maps::tell_of_change(view, now, map, plan);
     let site = view.site.clone();
+    if view.sites.get(site.site_id().as_str()).is_some_and(|stored| stored.row.text != site_text) {
+        arrivals::forget(view, now, plan);
+    }
     plan.decide(view, now, "fleet", |tx| {
         let row = SiteRow {
             site_id: site.site_id().clone(),

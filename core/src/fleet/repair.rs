@@ -7,7 +7,9 @@ use super::Tx;
 use super::heard::{is_fresh, is_settled, lease_stands, presence};
 use super::tasks::{News, happen};
 use super::view::View;
-use super::{Board, Plan, Tally, answers, claims, errands, inbox, incidents, load, maps, places, plausible, tasks};
+use super::{
+    Board, Plan, Tally, answers, arrivals, claims, errands, inbox, incidents, load, maps, places, plausible, tasks,
+};
 use crate::ids::{AttemptId, RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -77,6 +79,7 @@ fn compare(view: &mut View, now: Now, live: &Live, tally: &mut Tally, plan: &mut
         return;
     }
     plan.decide(view, now, "fleet", |tx| {
+        arrivals::note_standing(tx, live);
         attempt(tx, robot_id, live, tally);
         unknown(tx, robot_id, live);
         recharge(tx, robot_id, live);
@@ -173,7 +176,11 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
         }
         Some(l) if l.state.is_over() && l.state != WorkState::Failed => {
             tally.repaired += 1;
-            inbox::attempt(tx, robot_id, &report(l.state), tally);
+            let report = report(l.state);
+            match arrivals::unseen(tx.view, &tx.now, robot_id, &report) {
+                Some(place_id) => arrivals::disbelieve(tx, robot_id, &report, &place_id),
+                None => inbox::attempt(tx, robot_id, &report, tally),
+            }
         }
         Some(l) if l.state == WorkState::StepUnknown => {
             let Some(task_id) = id.subject.task_id() else { return };

@@ -5,7 +5,7 @@
 use super::queue::Wait;
 use super::rows::{RobotControl, RobotHolder};
 use super::view::View;
-use super::{Board, Slice, claims, heard, load, maps, plausible, standing, way};
+use super::{Board, Slice, arrivals, claims, heard, load, maps, plausible, standing, way};
 use crate::energy::Trip;
 use crate::ids::{RobotId, Subject};
 use crate::limits;
@@ -36,6 +36,7 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
     decided_by_people(view, robot_id, Some(live))?;
     reported(live)?;
     plausible::keeps_back(view, live)?;
+    arrivals::screen(view, robot_id)?;
     if let Some(why) = maps::differs(view, live) {
         return Err(why);
     }

@@ -235,6 +235,7 @@ pub fn about_robot(reason: Reason, robot_id: &RobotId) -> Reason {
         | Code::RobotUnlocated
         | Code::ReportImplausible
         | Code::PlacesImplausible
+        | Code::GoalNotEntered
         | Code::MapDiffers
         | Code::RobotNotUnderstood
         | Code::AttemptUnknown => format!("a person at robot {robot_id}"),

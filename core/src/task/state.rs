@@ -4,7 +4,7 @@ use super::machine::{Phase, Then};
 use super::spec::TaskSpec;
 use crate::audit::Note;
 use crate::authority::Authority;
-use crate::ids::{AttemptId, RobotId, Subject, TaskId, WaypointId};
+use crate::ids::{AttemptId, PlaceId, RobotId, Subject, TaskId, WaypointId};
 use crate::reason::Reason;
 use crate::robot::Fault;
 use crate::rows::{Index, Record, Table};
@@ -249,6 +249,15 @@ pub struct Uncertain {
     pub cause: Reason,
 }
 
+/// Where the robot of an attempt was while it had it, as far as its work is done there.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Been {
+    /// The ring in which the robot wrote its events when it was given the attempt: what another one tells is not the whole.
+    pub ring: String,
+    /// Standing places at which a step is done and that it entered, or stood in already: at most one a step.
+    pub places: BTreeSet<PlaceId>,
+}
+
 /// One grant of a task or errand to one robot.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Attempt {
@@ -288,6 +297,9 @@ pub struct Attempt {
     pub stats: WorkStats,
     /// Version of the robot's base software when it was granted.
     pub software: String,
+    /// Where the robot was while it had it. None: it is an errand, an older version began it, or a part of it was lost or cannot be compared.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub been: Option<Been>,
 }
 
 impl Attempt {

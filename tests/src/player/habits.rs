@@ -44,6 +44,8 @@ habits! {
     LetsGo "accepts and lets go";
     /// It takes offers and says at once that they cannot be done as asked.
     CallsImpossible "fails as semantic";
+    /// It takes offers and says at once that every step is done, and goes nowhere.
+    NeverGoes "succeeds from afar";
     /// It says what it has said again, under new numbers.
     RepeatsItself "repeats itself";
     /// It says of its attempt what contradicts what it has said.
@@ -103,7 +105,7 @@ impl Player {
             Habit::NeverAnswers | Habit::AnswersLate | Habit::Refuses | Habit::NeverMovesOn | Habit::NeverEnds => {
                 return;
             }
-            Habit::LetsGo | Habit::CallsImpossible => return,
+            Habit::LetsGo | Habit::CallsImpossible | Habit::NeverGoes => return,
             Habit::WrongClocks | Habit::LosesNumbers => return,
             Habit::FallsSilent | Habit::Restarts | Habit::StartsTwice => 0.05,
             Habit::EndlessLists | Habit::ClaimsUpdates | Habit::EndlessTexts | Habit::FloodsStatus => 0.1,

@@ -15,7 +15,7 @@ use midshift_core::limits;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{HeldPlace, Inventory, Lane, ReportedAttempt, ReportedState, StopLevel, Vitals, WorkState};
 use midshift_core::site::Site;
-use midshift_core::work::{DesiredWork, Gap, InboxItem, RobotEvent, Sample, SampleBody};
+use midshift_core::work::{DesiredWork, Gap, InboxItem, PlaceNews, RobotEvent, Sample, SampleBody};
 use midshift_proto::link::v1;
 use midshift_proto::session::{
     ClockSample, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, LanePosition, Previous, ToRobot, Uplink, Welcome,
@@ -121,6 +121,10 @@ pub struct Player {
     seconds: u64,
     /// Something was noted since it last said what it keeps.
     fresh: bool,
+    /// Places in which it ever said that it is, or at which it said that it stands.
+    said_in: BTreeSet<PlaceId>,
+    /// It said of itself that something will never come, or writes in another ring.
+    lost_words: bool,
 }
 
 impl Player {
@@ -170,6 +174,8 @@ impl Player {
             second: false,
             seconds: 0,
             fresh: false,
+            said_in: BTreeSet::new(),
+            lost_words: false,
         }
     }
     /// Its name.
@@ -194,6 +200,13 @@ impl Player {
         let has = self.job.as_ref().is_some_and(|job| job.assignment.attempt == *attempt);
         has && !self.disowned.contains(attempt) && !self.deeds.contains_key(Habit::WrongGenerations.name())
     }
+    /// Whether it never said that it was in this place, and has no excuse: nothing that it said is lost or too long to be read, one machine has
+    /// its name, and it has applied no more than it was given.
+    pub fn was_never_in(&self, place_id: &PlaceId) -> bool {
+        let excuses = [Habit::StartsTwice, Habit::WrongGenerations, Habit::EndlessLists, Habit::EndlessTexts];
+        let is_excused = self.lost_words || excuses.iter().any(|habit| self.deeds.contains_key(habit.name()));
+        !is_excused && !self.said_in.contains(place_id)
+    }
     /// The task whose load it last said that it has, in a heartbeat.
     pub fn said_load(&self) -> Option<&TaskId> {
         self.state.load.as_ref()?.task_id.as_ref()
@@ -213,6 +226,7 @@ impl Player {
             self.misbehave(habit, 0, &mut reported);
         }
         self.lists(&reported.attempts);
+        self.says_where(&reported);
         let position = |(lane, last): (&Lane, &u64)| {
             let first = self.kept.iter().find(|(kept, _)| kept == lane).map_or(last + 1, |(_, sample)| sample.seq);
             (*lane, LanePosition { first_seq: first, next_seq: last + 1 })
@@ -309,6 +323,7 @@ impl Player {
     }
     /// Forgets what it has said, in a new ring.
     fn format(&mut self) {
+        self.lost_words = true;
         self.ring = format!("{}-{}", self.robot_id, self.rng.random::<u32>());
         self.produced.clear();
         self.kept.clear();
@@ -358,6 +373,7 @@ impl Player {
             self.misbehave(habit, now_ms, &mut report);
         }
         self.lists(&report.attempts);
+        self.says_where(&report);
         let sent_unix_us = self.stamp(unix_ms).saturating_mul(1_000);
         let heartbeat = Heartbeat { reported: report, sent_unix_us, clock: self.echo.take() };
         (&FromRobot::Uplink(Uplink { heartbeat: Some(heartbeat), batches: Vec::new() })).into()
@@ -396,6 +412,7 @@ impl Player {
                 let (seq, reason) = (sample.seq, Code::Overflow.into());
                 let to_seq = if self.rng.random_bool(0.05) { limits::COUNTED_MAX - 1 } else { seq };
                 batch.items.insert(at, InboxItem::Gap(Gap { lane, from_seq: seq, to_seq, reason }));
+                self.lost_words = true;
                 self.kept.retain(|(kept, sample)| *kept != lane || !(seq..=to_seq).contains(&sample.seq));
             }
         }
@@ -417,6 +434,9 @@ impl Player {
         if let RobotEvent::Attempt(report) = &event {
             self.says_of(&report.attempt, report.state);
         }
+        if let RobotEvent::Place { place_id, news: PlaceNews::Entered, .. } = &event {
+            self.said_in.insert(place_id.clone());
+        }
         self.produce(Lane::Event, SampleBody::Event(event));
     }
     /// Notes what it says of an attempt.
@@ -432,6 +452,12 @@ impl Player {
         attempts.iter().for_each(|listed| self.says_of(&listed.attempt, listed.state));
         let at_hand = self.job.as_ref().map(|job| job.assignment.attempt.clone());
         self.disowned.extend(at_hand.filter(|id| attempts.iter().all(|listed| listed.attempt != *id)));
+    }
+    /// Notes where it says that it is.
+    fn says_where(&mut self, report: &ReportedState) {
+        let inside = report.places.iter().filter(|held| held.inside).map(|held| held.place_id.clone());
+        let stands = report.vitals.waypoint.iter().filter_map(|waypoint| PlaceId::parse(waypoint.as_str()).ok());
+        self.said_in.extend(inside.chain(stands));
     }
     fn alarm(&mut self, event: RobotEvent) {
         self.produce(Lane::Critical, SampleBody::Event(event));

@@ -125,6 +125,12 @@ impl Player {
             self.end(state);
         } else if self.shows(Habit::CallsImpossible, 0.8) {
             self.end(WorkState::Failed);
+        } else if self.shows(Habit::NeverGoes, 0.8) {
+            let steps = self.job.as_ref().map_or(0, |job| job.assignment.steps.len() as u32);
+            if let Some(listed) = self.listed() {
+                listed.step_index = steps;
+            }
+            self.end(WorkState::Succeeded);
         }
     }
     /// A step is done.

@@ -40,6 +40,7 @@ const TWINS: &[(&str, &[Twin])] = &[
             // Over a store where the last writer wins.
             ("EverybodyLeads", 2, FLEET),
             ("LateReportsCount", 3, FLEET),
+            ("SuccessIsBelieved", 3, FLEET),
             ("HeartbeatOvertakesEvents", 3, FLEET),
             ("TimeoutFreesPlace", 6, FLEET),
             ("CapacityIsForgotten", 7, FLEET),

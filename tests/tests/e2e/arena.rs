@@ -62,11 +62,12 @@ const ALIVE: [TaskState; 8] = [
     TaskState::NeedsOperator,
 ];
 /// What a robot's explanation says that only a person solves, and the incident that tells a person so.
-const OF_PEOPLE: [(&str, &str); 8] = [
+const OF_PEOPLE: [(&str, &str); 9] = [
     ("ROBOT_DOES_NOT_ANSWER", "ROBOT_DOES_NOT_ANSWER"),
     ("ROBOT_BROKEN_OFF", "ROBOT_BREAKER_OPENED"),
     ("REPORT_IMPLAUSIBLE", "REPORT_IMPLAUSIBLE"),
     ("PLACES_IMPLAUSIBLE", "PLACES_IMPLAUSIBLE"),
+    ("GOAL_NOT_ENTERED", "GOAL_NOT_ENTERED"),
     ("ATTEMPT_UNKNOWN", "ATTEMPT_UNKNOWN"),
     ("EXCLUSION_BROKEN", "EXCLUSION_BROKEN"),
     ("DECISION_PUT_ASIDE", "DECISION_PUT_ASIDE"),

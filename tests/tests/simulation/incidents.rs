@@ -17,7 +17,7 @@ pub const ASKED: &str = "what a person must solve has an incident";
 pub const NOT_BLAMED: &str = "no honest robot opens an incident of robots that behave badly";
 
 /// What honest robots never bring about.
-const OF_BAD_ROBOTS: [Code; 11] = [
+const OF_BAD_ROBOTS: [Code; 12] = [
     Code::RobotDoesNotAnswer,
     Code::OffersNotAnswered,
     Code::ReportImplausible,
@@ -27,14 +27,16 @@ const OF_BAD_ROBOTS: [Code; 11] = [
     Code::PlacesImplausible,
     Code::ExclusionBroken,
     Code::GrantUnknown,
+    Code::GoalNotEntered,
     Code::DecisionPutAside,
     Code::WorkUnreadable,
 ];
 
 /// What the words of one robot alone may open again and again.
-const BY_WORDS: [Code; 8] = [
+const BY_WORDS: [Code; 9] = [
     Code::AttemptUnknown,
     Code::ExclusionBroken,
+    Code::GoalNotEntered,
     Code::GrantUnknown,
     Code::PlacesImplausible,
     Code::ReportImplausible,

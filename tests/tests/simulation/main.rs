@@ -140,6 +140,7 @@ fn naive_of(name: &str) -> room::Naive {
         "late_reports_count" => fleet(Fleet::LateReportsCount),
         "holds_come_at_once" => fleet(Fleet::HoldsComeAtOnce),
         "each_word_is_told" => fleet(Fleet::EachWordIsTold),
+        "success_is_believed" => fleet(Fleet::SuccessIsBelieved),
         "fenced_reports_rebuild" => fleet(Fleet::FencedReportsRebuild),
         "authority_from_receipt" => agent(SeededBug::AuthorityFromReceipt),
         "grant_from_receipt" => agent(SeededBug::GrantFromReceipt),

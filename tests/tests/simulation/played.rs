@@ -14,9 +14,9 @@ use crate::run::{Outcome, outcome_of};
 use crate::{every_seed_holds, hash_of, report_seed};
 use midshift_core::ids::{AttemptId, RobotId, TaskId};
 use midshift_core::rows::Table;
-use midshift_core::site::DEMO;
-use midshift_core::task::Attempt;
+use midshift_core::site::{DEMO, Site};
 use midshift_core::task::machine::Phase;
+use midshift_core::task::{Attempt, TaskIntake};
 use midshift_proto::task::v1::CancelTaskRequest;
 use midshift_sim::faults::FaultRates;
 use midshift_store::Store;
@@ -49,7 +49,7 @@ const LOOK_AFTER_MS: u64 = 10_000;
 const STANDS_MS: u64 = 240_000;
 
 /// Laws beyond those of the witness, by the name under which each is looked at.
-const LAWS: [&str; 7] = [GOES_ON, BUILT_ANEW, REFUSED, BOUNDED, TOLD, ASKED, ONCE];
+const LAWS: [&str; 8] = [GOES_ON, BUILT_ANEW, REFUSED, BOUNDED, TOLD, ASKED, ONCE, WAS_THERE];
 /// What an honest robot works on is known, and over by its own word alone. That ready work finds it is a matter of `TOLD`: a robot that could
 /// take it is no reason for it to wait.
 pub const GOES_ON: &str = "honest robots' tasks go on";
@@ -60,15 +60,18 @@ pub const REFUSED: &str = "what the store refuses for good is not composed again
 pub const BOUNDED: &str = "memory is bounded";
 /// Nobody else is given what a robot has, and no item is put down twice.
 pub const ONCE: &str = "nobody's work is given twice";
+/// Players have no bodies: of them it is where they say that they were. What bodies did with the items of honest robots is a matter of `GOES_ON`.
+pub const WAS_THERE: &str = "no task is done by a robot that was never where it ends";
 
 /// Each naive rule, the law that it breaks, and the habit of every player that shows it.
-const TWINS: [(&str, &str, Habit); 7] = [
+const TWINS: [(&str, &str, Habit); 8] = [
     ("steps_are_not_told", TOLD, Habit::NeverMovesOn),
     ("doubt_is_kept_quiet", ASKED, Habit::WrongSteps),
     ("late_reports_count", GOES_ON, Habit::ForeignAttempts),
     ("silence_frees_task", ONCE, Habit::FallsSilent),
     ("holds_come_at_once", REFUSED, Habit::EndlessLists),
     ("each_word_is_told", BOUNDED, Habit::WrongPlaces),
+    ("success_is_believed", WAS_THERE, Habit::NeverGoes),
     ("fenced_reports_rebuild", BUILT_ANEW, Habit::ForeignAttempts),
 ];
 
@@ -77,6 +80,7 @@ const ROWS_MAX: usize = 2_000;
 
 struct Game {
     room: Room,
+    site: Arc<Site>,
     players: Vec<Arc<Mutex<Player>>>,
     names: BTreeSet<RobotId>,
     play_ms: u64,
@@ -130,7 +134,7 @@ impl Game {
         for task in tasks {
             room.desk.wish(Wish::Submit(Box::new(task)));
         }
-        Ok(Self { room, players, names, play_ms, asked: 0, stands: BTreeMap::new() })
+        Ok(Self { room, site, players, names, play_ms, asked: 0, stands: BTreeMap::new() })
     }
 
     fn run(mut self) -> Outcome {
@@ -248,6 +252,27 @@ impl Game {
             let times = drops.get(&task.task_id).copied().unwrap_or(0);
             let done = task.phase == Phase::Succeeded && times == 1;
             seen.check(GOES_ON, done, || format!("put down {times} times: {task:?}"));
+        }
+        self.judge_where(&mut seen);
+    }
+
+    /// What a player ended as done ends where it said that it was.
+    fn judge_where(&self, seen: &mut Observer) {
+        let site = &self.site;
+        let rows =
+            ready(self.room.store.snapshot(&[Table::TaskIntake])).map(|snapshot| snapshot.rows).unwrap_or_default();
+        for intake in rows.iter().filter_map(|row| row.decode::<TaskIntake>().ok()) {
+            let task = seen.tasks().get(&intake.task_id).filter(|task| task.phase == Phase::Succeeded);
+            let Some(robot_id) = task.and_then(|task| task.robot_id.clone()) else { continue };
+            let end = intake.spec.goals(0).last().and_then(|waypoint| site.standing_at(site.find(waypoint)?));
+            let Some(end) = end.map(|place| &site.place(place).place_id) else { continue };
+            for player in &self.players {
+                let player = player.lock().unwrap_or_else(PoisonError::into_inner);
+                if *player.robot_id() == robot_id {
+                    let holds = !player.was_never_in(end);
+                    seen.check(WAS_THERE, holds, || format!("{robot_id} was never in {end}: {}", intake.task_id));
+                }
+            }
         }
     }
 

@@ -1,5 +1,6 @@
 //! A picture with robots that stand idle and tasks that wait, for tests of one cycle.
 
+mod arrivals;
 mod backlog;
 mod closures;
 mod drains;

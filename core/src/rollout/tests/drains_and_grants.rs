@@ -351,6 +351,7 @@ fn charge(id: &crate::ids::AttemptId, errand: crate::task::state::Errand) -> cra
         refusal: None,
         stats: WorkStats::default(),
         software: String::new(),
+        been: None,
     }
 }
 

@@ -3,6 +3,7 @@
 
 mod harness;
 
+mod arrivals;
 mod claims;
 mod drains;
 mod ended;

@@ -1,6 +1,6 @@
 //! Why the rules are as they are: each scenario is played with the rule, which holds, and with the naive one, which does not.
 
-use crate::harness::World;
+use crate::harness::{Answer, World};
 use midshift_core::fleet::bugs::{Bugs, SeededBug};
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
@@ -243,4 +243,20 @@ async fn said_in_a_newer_word(bugs: &[SeededBug]) -> bool {
 async fn a_state_of_a_newer_version_is_told_to_a_person_and_a_rule_that_takes_it_acts_upon_it() {
     assert!(said_in_a_newer_word(&[]).await);
     assert!(!said_in_a_newer_word(&[SeededBug::UnknownStatesAreTaken]).await);
+}
+
+/// A robot that never left its place says that it is done. What the task is then.
+async fn told_done_by_a_robot_that_never_left(bugs: &[SeededBug]) -> Phase {
+    let mut w = world(bugs).await;
+    w.robot("r1", "park-a").await;
+    w.r("r1").answer = Answer::LetGo(WorkState::Succeeded);
+    w.submit("T1", "A", "B").await;
+    w.pass(5).await;
+    w.seen().await.phase("T1")
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_success_from_elsewhere_is_asked_about_and_where_it_is_believed_a_task_is_done_that_nobody_did() {
+    assert_eq!(told_done_by_a_robot_that_never_left(&[]).await, Phase::NeedsOperator);
+    assert_eq!(told_done_by_a_robot_that_never_left(&[SeededBug::SuccessIsBelieved]).await, Phase::Succeeded);
 }

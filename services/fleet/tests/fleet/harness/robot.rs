@@ -21,7 +21,7 @@ pub enum Answer {
     Accept,
     Refuse(Code),
     Ignore,
-    /// It takes it and says in the same breath that it ended so; FAILED: because the work cannot be done as asked.
+    /// It takes it and says in the same breath that it ended so; FAILED: because the work cannot be done as asked; SUCCEEDED: with every step.
     LetGo(WorkState),
     /// It says that it is over, and never took it.
     CallOver,
@@ -432,7 +432,11 @@ impl Robot {
             Answer::Accept | Answer::LetGo(_) if !anchored => self.refuse(&new.attempt, Code::StaleAuthority),
             Answer::Accept => self.accept(new),
             Answer::LetGo(state) => {
+                let steps = new.steps.len() as u32;
                 self.accept(new);
+                if state == WorkState::Succeeded {
+                    self.step = steps;
+                }
                 self.end(state, (state == WorkState::Failed).then(impossible));
             }
             Answer::CallOver => {
