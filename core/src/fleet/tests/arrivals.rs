@@ -191,6 +191,9 @@ fn a_drive_that_may_fail_or_that_ends_where_nothing_is_reserved_asks_for_nothing
     }
 }
 
+/// What makes it impossible to tell.
+type Excuse<'a> = &'a dyn Fn(&mut Rig);
+
 #[test]
 fn what_nobody_can_tell_is_believed() {
     let gap = |rig: &mut Rig| {
@@ -213,7 +216,7 @@ fn what_nobody_can_tell_is_believed() {
         start(rig);
     };
     let unreadable = |rig: &mut Rig| rig.view.places.retain(|place, _| place != "A" && place != "B");
-    let excuses: [(&str, &dyn Fn(&mut Rig)); 7] = [
+    let excuses: [(&str, Excuse); 7] = [
         ("events were lost", &gap),
         ("an event could not be read", &unread),
         ("it writes in another ring", &lost_memory),
