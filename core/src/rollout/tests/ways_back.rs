@@ -158,24 +158,6 @@ fn no_order_back_is_signed_for_a_machine_with_another_key_until_a_person_takes_i
 }
 
 #[test]
-fn a_mended_robot_that_shows_another_key_is_not_ordered_back_until_a_person_takes_it() {
-    let mut rig = half();
-    let n = rig.order()[0];
-    rig.robots[n].fate = Fate::KeepsNothing;
-    rig.must("ro", Verb::Abort);
-    rig.until(100, |r| r.phase() == Phase::Aborted);
-    rig.robots[n].fate = Fate::Good;
-    let last = section(&rig, n).generation;
-    let device_key = rig.shows_another_key(n);
-    rig.ask(&unstick(n)).expect("it is stuck");
-    rig.ticks(30);
-    assert_held_back(&rig, n, &device_key, last);
-    accept(&mut rig, n, device_key);
-    rig.until(30, |r| r.step(n) == Step::RolledBack);
-    assert!(section(&rig, n).generation > last, "by an order of its own");
-}
-
-#[test]
 fn a_roll_out_that_takes_another_back_waits_for_nobody_whose_key_a_person_must_take() {
     let n = 2;
     let mut rig = left_another(n);
