@@ -5,7 +5,7 @@
 
 use crate::audit;
 use ed25519_dalek::pkcs8::spki::der::pem::LineEnding;
-use ed25519_dalek::pkcs8::{DecodePrivateKey, EncodePrivateKey};
+use ed25519_dalek::pkcs8::{DecodePrivateKey, EncodePrivateKey, KeypairBytes};
 use ed25519_dalek::{Signature, Signer, SigningKey};
 use midshift_core::limits;
 use midshift_core::stop::{Reset, Stop};
@@ -67,7 +67,9 @@ impl Key {
         if path.try_exists()? {
             audit::set_aside(&path, now)?;
         }
-        let text = self.0.to_pkcs8_pem(LineEnding::LF).map_err(io::Error::other)?;
+        // Without the public half, so that other tools read it as well.
+        let alone = KeypairBytes { secret_key: self.0.to_bytes(), public_key: None };
+        let text = alone.to_pkcs8_pem(LineEnding::LF).map_err(io::Error::other)?;
         midshift_durable::replace_with(&path, text.as_bytes(), midshift_durable::PRIVATE)
     }
 
@@ -160,6 +162,20 @@ mod tests {
         };
         assert!(knows(&back));
         assert!(!knows(&Reset { at: Utc(3), ..back }));
+    }
+
+    #[test]
+    fn a_key_is_kept_without_its_public_half_and_read_with_it_too() {
+        let folder = tempfile::tempdir().unwrap();
+        let key = kept(folder.path());
+        let path = folder.path().join(NAME);
+        let text = fs::read_to_string(&path).unwrap();
+        assert!(KeypairBytes::from_pkcs8_pem(&text).unwrap().public_key.is_none());
+        let both = key.0.to_pkcs8_pem(LineEnding::LF).unwrap();
+        assert_ne!(*both, text);
+        fs::write(&path, both.as_bytes()).unwrap();
+        let Found::There(older) = Key::read(folder.path()).unwrap() else { panic!("it is there") };
+        assert_eq!(older.public(), key.public());
     }
 
     #[test]
