@@ -97,7 +97,8 @@ mod tests {
         };
         let empty = cost(&[], None);
         assert_eq!(empty, 21_349, "100 m at 120 mWh, 333 s at 80 W, and a tenth");
-        assert!(cost(&[action("inspect")], None) > empty);
+        let stands = StepKind::Wait { duration_ms: 20_000 };
+        assert!(cost(&[action("inspect")], None) > cost(&[stands], None), "some four seconds of work");
         assert!(cost(&[action("pick")], None) > cost(&[action("inspect")], None) + 3_000);
         assert_eq!(cost(&[action("pick"), action("place")], None), cost(&[action("inspect"), action("inspect")], None));
         assert!(cost(&[StepKind::Wait { duration_ms: 60_000 }], None) > empty + 1_000);

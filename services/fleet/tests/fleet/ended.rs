@@ -117,7 +117,8 @@ async fn a_process_that_reads_for_longer_than_half_a_minute_lets_another_one_lea
     let (_slow, way) = w.other_process();
     w.robot("r1", "park-a").await;
     w.pass(2).await;
-    way.read_for(Duration::from_secs(600));
+    // Longer than anything here is waited for.
+    way.read_for(Duration::from_secs(7_200));
     w.kill_first().await;
     w.pass(10).await;
     let (_third, _) = w.other_process();
