@@ -56,6 +56,7 @@ async fn an_honest_robot_whose_server_starts_anew_on_its_way_is_believed() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
     w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::Running).await;
     w.until("it has left A", |s| s.attempt("T1").step_index >= 2 && !s.has("r1", "A")).await;
     w.stop_fleet().await;
     w.start_fleet();
