@@ -574,7 +574,7 @@ pub const CLOCK_JUMP_STANDING: LinkDuration = LinkDuration::from_secs(600);
 pub const CLOCK_SLEW_PART: u64 = 1_000;
 /// Nothing is signed by a wall that stepped more than this while it ran. Far below the day that a timestamp lives, and above what NTP steps.
 pub const CLOCK_DOUBT: LinkDuration = LinkDuration::from_secs(300);
-/// Nor by one that at a start is further than this past the newest time of the store: longer than a site stands still over holidays of a week.
+/// Nor by one that at a start is further than this past the newest time of the store that was in no doubt: longer than a site stands still over holidays of a week.
 pub const CLOCK_DOUBT_START: LinkDuration = LinkDuration::from_secs(7 * 24 * 3_600);
 
 // --- identity

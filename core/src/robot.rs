@@ -141,6 +141,8 @@ pub const FAULT_JAM: u32 = 2001;
 pub const FAULT_TIMEOUT: u32 = 1003;
 /// What the robot runs is not what was signed and committed: said by the agent, not by the maker.
 pub const FAULT_SOFTWARE: u32 = 9001;
+/// The robot said that its work is done and was not where that is done: said by the server, of no robot's own.
+pub const FAULT_DISBELIEVED: u32 = 9002;
 /// The work names what the body or map does not have.
 pub const FAULT_SEMANTIC: u32 = 4001;
 

@@ -15,6 +15,7 @@ use super::view::View;
 use super::{Plan, Tx, claims, inbox, incidents, plausible};
 use crate::ids::{AttemptId, PlaceId, RobotId, TaskId};
 use crate::reason::{Code, Reason};
+use crate::robot::{FAULT_DISBELIEVED, Fault, FaultClass};
 use crate::site::Site;
 use crate::task::{Attempt, AttemptPhase, Event};
 use crate::time::Now;
@@ -138,8 +139,10 @@ pub fn wait(tx: &mut Tx, report: &AttemptReport) {
 pub fn disbelieve(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, place_id: &PlaceId) {
     let Some(task_id) = report.attempt.subject.task_id() else { return };
     let Some(step_index) = tx.view.attempt(&report.attempt).map(|a| a.step_index) else { return };
+    let message = format!("it was never seen at {place_id}");
+    let fault = Some(Fault { code: FAULT_DISBELIEVED, class: FaultClass::Mechanical, message });
     // Of its word counts what it adds, and no step.
-    let report = AttemptReport { step_index, ..report.clone() };
+    let report = AttemptReport { step_index, fault, ..report.clone() };
     let why = told(robot_id, task_id, place_id);
     incidents::open_as(tx, incident_of(robot_id), why.clone(), Some(robot_id), Some(task_id));
     happen(tx, task_id, News { event: Event::FailedFinal, why: Some(&why), report: Some(&report) });

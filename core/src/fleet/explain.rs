@@ -199,15 +199,19 @@ fn barring(why: Option<&Reason>) -> Option<&Reason> {
     why.filter(|why| why.code == Code::PlaceBlocked && !why.message.is_empty())
 }
 
-/// The robot carries what is of no task that waits for it, of one that waits for a person or for its next try, or what a person has put back.
+/// The robot carries what is of no task that waits for it, its own item of one that waits for a person or for its next try, or what a person has
+/// put back.
 fn carries(view: &View, board: &Board, robot_id: &RobotId) -> Option<Reason> {
     let load = load::carried(view, board.get(robot_id)?)?;
     let task = load.task_id.as_ref().and_then(|id| view.task(id));
-    let asks = task.is_some_and(|task| matches!(task.phase, Phase::NeedsOperator | Phase::RetryWait));
     let is_its_own = |task: &TaskState| {
         let is_item = view.intake(&task.task_id).is_some_and(|intake| load::is_item_of(load, task, intake));
         is_item && task.opened.as_ref().is_none_or(|r| r == robot_id)
     };
+    let asks = task.is_some_and(|task| match task.phase {
+        Phase::RetryWait => is_its_own(task),
+        phase => phase == Phase::NeedsOperator,
+    });
     if !asks && task.is_some_and(is_its_own) {
         return None;
     }

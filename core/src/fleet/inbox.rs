@@ -129,11 +129,14 @@ pub(super) fn release(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
 
 /// Obeys news of a place.
 pub fn place(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64, news: PlaceNews) {
-    let Some(mut place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
-    let was_inside = place.holder(robot_id).is_some_and(|holder| holder.state == HolderState::Inside);
+    let known = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone());
+    let holder = known.as_ref().map(|place| place.holder(robot_id));
+    // Of a place whose row cannot be read nobody knows whether it stood there.
+    let was_inside = holder.is_none_or(|holder| holder.is_some_and(|holder| holder.state == HolderState::Inside));
     if was_inside || news == PlaceNews::Entered {
         arrivals::note(tx, robot_id, place_id);
     }
+    let Some(mut place) = known else { return };
     let Some(at) = place.holders.iter().position(|h| h.robot_id == *robot_id && h.grant_id == grant_id) else {
         if news == PlaceNews::Entered {
             claims::take_over(tx, robot_id, place_id, grant_id);

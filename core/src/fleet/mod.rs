@@ -73,7 +73,7 @@ pub type Tx<'a> = crate::picture::Tx<'a, View>;
 /// The newest heartbeat of every robot.
 pub type Board = BTreeMap<RobotId, Arc<Live>>;
 
-/// What was counted while rows were compared and events taken.
+/// What was counted on the way.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Tally {
     /// Reports of an epoch that had passed, or of nothing that is known.
@@ -101,7 +101,7 @@ pub struct Report {
     pub more: bool,
     /// Waiting tasks by reason.
     pub waiting: BTreeMap<Code, u64>,
-    /// What was counted while rows were compared and events taken.
+    /// What was counted on the way.
     pub tally: Tally,
     /// Robots and tasks that stand for long without a reason, once each; logged.
     pub unexplained: Vec<String>,

@@ -218,7 +218,10 @@ fn serve(tx: &mut Tx, live: &Live, releases: &mut Releases, traffic: &mut Traffi
     tx.view.place_waits += u64::from(!tx.view.waits.contains_key(robot_id));
     let since = tx.view.waits.entry(robot_id.clone()).or_insert(Waiting { places: Vec::new(), since: now }).since;
     tx.view.waits.insert(robot_id.clone(), Waiting { places: names, since });
-    note_wait(tx, robot_id, since);
+    // It asks for one stretch ahead: with way left before it, it does not stand for that.
+    if !is_whole || is_out_of_route(tx.view, live, &a) {
+        note_wait(tx, robot_id, since);
+    }
     if step_aside(tx, &a, &work, since, releases, traffic) {
         return;
     }

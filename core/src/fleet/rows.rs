@@ -411,7 +411,7 @@ pub struct Incident {
 /// A person has looked into an incident.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Closed {
-    /// The actor that looked, by name.
+    /// Who closed it, by name; `fleet`: it was over by itself.
     pub actor: String,
     /// What was found.
     pub reason: String,

@@ -25,12 +25,12 @@ use std::collections::BTreeMap;
 /// Here and above E speaks for an abort, micro-nats.
 const ABORT: i64 = ln_micronats(ABORT_EVIDENCE as u128, 1, Rounding::Nearest);
 
-/// Tasks that ended on a robot or on several. What a person canceled counts nowhere.
+/// How work ended on a robot or on several. What a person canceled counts nowhere.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct TaskTally {
     /// Tasks that succeeded.
     pub succeeded: u64,
-    /// Tasks that failed.
+    /// Attempts that ended by a fault, also of tasks that were done later.
     pub failed: u64,
 }
 

@@ -12,8 +12,7 @@ use super::view::View;
 use crate::ids::RolloutId;
 use crate::reason::{Code, Reason};
 
-const OFFERED_TO_NOBODY: &str =
-    "A roll-out ended, and people had kept all of its robots from it: excluded, pinned or retired them.";
+const OFFERED_TO_NOBODY: &str = "A roll-out ended that was offered to no robot: people had excluded, pinned or retired all of them, or it had none.";
 
 /// Robots of a roll-out as its ending counts them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -17,7 +17,10 @@ use crate::work::{Live, WorkState};
 /// Whether the bundle has jammed a robot on trial whose gate is open.
 pub fn is_blamed(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
     let long = r.moments.on_trial.is_some_and(|at| now.ms_since(at) >= limits::JAMMED_AFTER.as_ms());
-    let stands = long && is_open_to(rollout, r) && stood(view, board, now, &r.robot_id).is_some_and(is_long);
+    let waited = view.control.get(r.robot_id.as_str()).and_then(|control| control.row.waited_for_place);
+    let since_wait = |stood: SiteDuration| waited.map_or(stood, |at| stood.min(SiteDuration(now.ms_since(at))));
+    let stood = stood(view, board, now, &r.robot_id).map(since_wait);
+    let stands = long && is_open_to(rollout, r) && stood.is_some_and(is_long);
     stands && others_get_on(view, board, now, rollout, r)
 }
 
@@ -32,11 +35,8 @@ fn stood(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Option<Si
         |state: WorkState| matches!(state, WorkState::Accepted | WorkState::Navigating | WorkState::Executing);
     let has_work = live.report.attempts.iter().any(|a| is_on_its_way(a.state));
     // Before the start of the service nobody watched.
-    let stood = now.site.since(live.progress_at.max(view.started.site));
-    let waited = view.control.get(robot_id.as_str()).and_then(|control| control.row.waited_for_place);
-    let since_wait = waited.map(|at| SiteDuration(now.ms_since(at)));
-    let waits = since_wait.is_some_and(|since| since.as_ms() < 2 * limits::PLACE_WAIT_NOTED.as_ms());
-    (has_work && !is_held(live) && !waits).then(|| since_wait.map_or(stood, |since| stood.min(since)))
+    let since = live.progress_at.max(view.started.site);
+    (has_work && !is_held(live)).then(|| now.site.since(since))
 }
 
 fn is_held(live: &Live) -> bool {

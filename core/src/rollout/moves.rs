@@ -308,7 +308,7 @@ fn number(tx: &mut Tx, used: u64) -> u64 {
 }
 
 /// The highest permission that a robot says it has used. After a jump of the clock it may lie ahead of everything that a store of before knows; what
-/// lies further ahead than a clock jumps is not followed, so that no robot moves the numbers of all.
+/// lies further ahead than a clock jumps is not followed: so far the word of one robot moves the numbers of all.
 fn used_grant(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> u64 {
     let said = board.get(robot_id).and_then(|live| live.report.update.as_ref());
     let known = view.software.get(robot_id.as_str()).and_then(|s| s.row.report.as_ref());

@@ -164,9 +164,9 @@ pub enum AttemptPhase {
     OfferExpired,
     /// The robot has done all steps.
     Succeeded,
-    /// Ended by a fault.
+    /// Ended by a fault, or its success was not believed.
     Failed,
-    /// It was stopped before its end.
+    /// It ended without having been done, as far as the record knows.
     Aborted,
     /// Given up by a person while nobody knew.
     Lost,

@@ -63,7 +63,7 @@ pub async fn check_start(data: &Path, clock: &dyn Clock, store: &dyn Store) -> a
 /// The newest time that was in no doubt, of a run before; none: there was none.
 fn believed(data: &Path) -> anyhow::Result<Option<Utc>> {
     let path = data.join(BELIEVED);
-    let reading = || format!("reading {}", path.display());
+    let reading = || format!("reading {}: if the clock of this machine is right, remove the file", path.display());
     match fs::read_to_string(&path) {
         Ok(text) => text.trim().parse().map(|ms| Some(Utc(ms))).with_context(reading),
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
@@ -78,8 +78,8 @@ fn keep_believed(data: &Path, clock: &dyn Clock, kept: Option<Utc>) -> Option<Ut
     match midshift_durable::replace(&data.join(BELIEVED), now.wall.0.to_string().as_bytes()) {
         Ok(()) => Some(now.wall),
         Err(error) => {
-            tracing::warn!(%error, file = BELIEVED, "the time is not kept for the next start");
-            kept
+            tracing::warn!(%error, file = BELIEVED, "the time is not kept for the next start; it is tried again in an hour");
+            Some(now.wall)
         }
     }
 }

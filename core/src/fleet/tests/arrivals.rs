@@ -7,11 +7,12 @@ use crate::fleet::rows::{HolderState, PlaceHolder};
 use crate::fleet::{Board, Pace, Plan, Tally, claims, found, inbox, screen};
 use crate::ids::{AttemptId, PlaceId, RobotId, WaypointId};
 use crate::reason::{Code, Reason};
-use crate::robot::{Lane, WorkState};
+use crate::robot::{FAULT_DISBELIEVED, Lane, WorkState};
 use crate::site::CORRIDOR;
 use crate::task::raw::RawStepKind;
 use crate::task::{AttemptPhase, Phase, RawTask};
 use crate::work::{AttemptReport, Gap, InboxEntry, InboxItem, PlaceNews, RobotEvent, Sample, SampleBody, WorkStats};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Steps of a transport.
@@ -119,6 +120,8 @@ fn a_robot_that_never_left_its_place_is_not_believed_and_gets_no_work() {
     }
     assert_eq!(task.stats.path_mm, 7, "what its event added is kept");
     assert_eq!(told(&rig), [reason]);
+    let failures: Vec<_> = rig.view.counters.values().map(|counter| counter.row.failures.clone()).collect();
+    assert_eq!(failures, [BTreeMap::from([(FAULT_DISBELIEVED, 1)])], "it counts against what it runs");
     assert_eq!(rig.view.held_by(&robot_id()), None, "it has let go by its own word");
     let why = screen::robot(&rig.view, &rig.board, &robot_id(), &rig.now).expect_err("no work");
     assert_eq!(why.code, Code::GoalNotEntered);

@@ -60,6 +60,20 @@ async fn who_stands_for_a_place_for_a_minute_is_written_down_each_minute() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn who_does_not_drive_the_way_that_it_has_does_not_stand_for_a_place_behind_it() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r2", "B").await;
+    w.robot("r1", "park-a").await;
+    w.r("r2").drives = false;
+    w.r("r1").drives = false;
+    w.submit_with("T1", "B", "A", |raw| (raw.robot_id, raw.stall_ms) = ("r1".to_owned(), Some(3_600_000))).await;
+    w.until("it has its way to the corridor", |s| s.has("r1", "wait-a")).await;
+    w.pass_while(300, "it stands where it is", |s| s.has("r1", "park-a") && !s.has("r1", "corridor")).await;
+    assert_eq!(w.seen().await.control("r1").waited_for_place, None);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_place_that_a_robot_says_it_is_in_is_nobody_elses_though_no_heartbeat_has_said_so_yet() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
