@@ -75,7 +75,7 @@ pub const UNANSWERED_PERMILLE_MAX: usize = 200;
 pub const UNANSWERED_AT_ONCE: LinkDuration = LinkDuration::from_secs(10);
 /// A robot that was told of no work and still lists an attempt that the server does not know of after this is a person's matter.
 pub const ATTEMPT_UNKNOWN_AFTER: LinkDuration = LinkDuration::from_secs(60);
-/// After an errand that a robot refused, failed or dropped it gets no other for this long.
+/// After an errand that a robot refused, failed or dropped, or ended sooner than this, it gets no other for this long.
 pub const ERRAND_PAUSE: LinkDuration = LinkDuration::from_secs(5);
 /// Refusals in a row before a person is asked: NO_ROBOT_ACCEPTS.
 pub const REFUSALS_IN_ROW: u32 = 5;

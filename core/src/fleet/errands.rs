@@ -179,7 +179,9 @@ pub fn report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
         WorkState::Aborted | WorkState::Suspended => AttemptPhase::Aborted,
     };
     if live.is_terminal() {
-        if live != AttemptPhase::Succeeded && a.phase != AttemptPhase::Stopping {
+        // One that is over as soon as it is given would be given without end.
+        let is_brief = tx.now.ms_since(a.offered) < limits::ERRAND_PAUSE.as_ms();
+        if (live != AttemptPhase::Succeeded || is_brief) && a.phase != AttemptPhase::Stopping {
             let until = tx.now.link + limits::ERRAND_PAUSE;
             tx.view.unwilling.insert(robot_id.clone(), until);
         }

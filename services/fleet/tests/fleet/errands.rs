@@ -6,6 +6,7 @@ use midshift_core::reason::Code;
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
 use midshift_core::task::state::Errand;
+use midshift_core::work::WorkState;
 use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
@@ -151,6 +152,17 @@ async fn a_robot_that_refuses_its_errands_is_not_asked_again_at_once() {
     assert!((2..=13).contains(&asked), "asked {asked} times in a minute");
     w.r("r1").answer = Answer::Accept;
     w.until("it has parked", |s| s.has("r1", "park-b") && s.is_free("r1")).await;
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_whose_errands_are_over_at_once_is_not_given_one_after_the_other() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "B").await;
+    w.r("r1").answer = Answer::LetGo(WorkState::Succeeded);
+    w.pass(60).await;
+    let asked = w.seen().await.control("r1").errands;
+    assert!((2..=13).contains(&asked), "asked {asked} times in a minute");
     w.lawful().await;
 }
 
