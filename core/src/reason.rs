@@ -208,7 +208,7 @@ codes! {
     RobotReconciling = "ROBOT_RECONCILING", "The robot's report differs from the record; it gets work once they agree.";
     RobotObserved = "ROBOT_OBSERVED", "Two sessions claim this robot id. This one is watched and gets no work.";
     RobotLoaded = "ROBOT_LOADED", "The robot carries something that is not of this task."
-        => "Take it off at the robot; if nothing is there, `midshift robot load ROBOT --none` says so.";
+        => "Take it off at the robot. If nothing is there and the robot only remembers it, `midshift robot load ROBOT --none` says so.";
     RobotFault = "ROBOT_FAULT", "The robot reports a fault that a person must look at.";
     RobotUnlocated = "ROBOT_UNLOCATED", "The robot has not reported a waypoint of this site.";
     BatteryLow = "BATTERY_LOW", "The charge does not reach pickup, drop and a charger with its reserve.";
@@ -227,8 +227,8 @@ codes! {
     RobotNotUnderstood = "ROBOT_NOT_UNDERSTOOD", "The robot dials and is refused each time, since what it says breaks the robot protocol. It closes by itself."
         => "Its maker must mend what the reason names.";
     ReportImplausible = "REPORT_IMPLAUSIBLE", "The robot reported a step or an end that cannot be. It frees nothing and moves nothing forward; the robot gets no work while it says so. Look at the robot's software.";
-    GoalNotEntered = "GOAL_NOT_ENTERED", "The robot said that a task was done and was never seen at a place where it had to be for that. The task waits for a person, and the robot gets no work until the incident is closed."
-        => "Look where the item is, then `midshift task resolve TASK`; look at the robot, then `midshift incident close INCIDENT --reason TEXT`.";
+    GoalNotEntered = "GOAL_NOT_ENTERED", "The robot said that a task, or a part of it, was done and was never seen at a place where it had to be for that. The task waits for a person, and the robot gets no work until the incident is closed."
+        => "Look where the item is, then `midshift task resolve TASK --as ANSWER --reason TEXT`; look at the robot, then `midshift incident close INCIDENT --reason TEXT`.";
     RobotDoesNotAnswer = "ROBOT_DOES_NOT_ANSWER", "The robot heard three offers within ten minutes and answered none, or refused five in a row. It gets one offer after ten minutes; if it takes that, this ends. Look at its software.";
     OffersNotAnswered = "OFFERS_NOT_ANSWERED", "Many robots did not answer offers at the same time, so none of them is blamed. Look at the server and its network.";
     AttemptUnknown = "ATTEMPT_UNKNOWN", "The robot has an attempt that this server does not know, and does not let it go. Look at the robot; once it stands still, `midshift robot disown ROBOT ATTEMPT` lets the server ignore it.";
@@ -269,7 +269,7 @@ codes! {
     ManualMode = "MANUAL_MODE", "A person took the robot over.";
     StepUnknown = "STEP_UNKNOWN", "The robot restarted inside a step that must not be done twice.";
     UncertainTooLong = "UNCERTAIN_TOO_LONG", "Nobody could say for five minutes what the robot did. Places in which it may be stay closed until it is heard."
-        => "Look at the robot, then `midshift task resolve TASK` and for each place that `midshift incident ls` names `midshift zone clear PLACE --reason TEXT --if-match ETAG`.";
+        => "Look at the robot, then `midshift task resolve TASK --as ANSWER --reason TEXT` and for each place that `midshift incident ls` names `midshift zone clear PLACE --reason TEXT --if-match ETAG`.";
     RobotDroppedIt = "ROBOT_DROPPED_IT", "The robot no longer has the attempt."
         => "If a place stays closed, `midshift incident ls` names it: look there, then `midshift zone clear PLACE --reason TEXT --if-match ETAG`.";
     Forced = "FORCED", "A person ended it by force; robot and places stay kept until the robot reports.";
@@ -395,7 +395,8 @@ codes! {
     CloneSeen = "CLONE_SEEN", "Two sessions with one robot id were alive at once." => "Find the second machine.";
     StoreBehindRobot = "STORE_BEHIND_ROBOT", "The robot says that it has applied a newer generation than this store gave: the store was restored from a backup, or the robot errs.";
     TaskBacklog = "TASK_BACKLOG", "Ready tasks wait for a robot for more than an hour. It closes by itself. `midshift task ls --state queued` lists them.";
-    RobotBreakerOpened = "ROBOT_BREAKER_OPENED", "A robot failed three attempts in ten minutes.";
+    RobotBreakerOpened = "ROBOT_BREAKER_OPENED", "A robot failed three attempts in ten minutes, and gets no work."
+        => "Look at it, then `midshift robot uncordon ROBOT`.";
     PlaceQuarantined = "PLACE_QUARANTINED", "A place, or a seat of it, is kept closed until the robot that may be inside reports or a person clears it."
         => "Look there, then `midshift zone clear PLACE --reason TEXT --if-match ETAG`; `midshift zone ls` shows the ETAG.";
     HoldByPerson = "HOLD_BY_PERSON", "A person asked for a pause.";

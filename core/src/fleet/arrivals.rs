@@ -1,25 +1,28 @@
-//! Whether a robot that says that its task is done was where that is done.
+//! Whether a robot that says that its task, or a part of it, is done was where that is done.
 //!
 //! 1. Every standing place of a goto that the attempt had to do must have been entered by its robot since it has the attempt, by its own
 //!    word: in order, since what it says of places and of attempts comes in one lane. Where it stood already counts.
-//! 2. An event that says it is done without that waits for the next heartbeat that counts. If that says the same, the task asks a person,
-//!    and the robot gets no work until a person has closed its incident.
-//! 3. What cannot be decided is believed: an event was lost, the robot writes in another ring, the map has changed, the store turned out to
-//!    be older than the robot, a person cleared the place, its row cannot be read, or an older version began the attempt.
+//! 2. An event that says that the work is over without that waits for the next heartbeat that counts. If that says the same, the task asks a
+//!    person, and the robot gets no work until a person has closed its incident. A failure owes the steps that it claims, a success all.
+//! 3. While the work goes on, a step that was claimed and not seen is not done for the task, unless a later one must not be done twice.
+//! 4. Once a part of its word is lost, or with another ring, a success owes its last goal, and nothing else is asked.
+//! 5. What cannot be decided is believed: the map has changed, the store turned out to be older than the robot, a person cleared the place,
+//!    its row cannot be read, or an older version began the attempt.
 //!
-//! Called by `inbox` for events, by `repair` for heartbeats, and by `screen`. Invariant: nothing here frees a place or moves a task forward.
+//! Called by `inbox` for events, by `repair` for heartbeats, by `tasks` for steps, and by `screen`. Invariant: nothing here frees a place or
+//! moves a task forward.
 
 use super::rows::HolderState;
 use super::tasks::{News, happen};
 use super::view::View;
-use super::{Plan, Tx, claims, inbox, incidents, plausible};
+use super::{Plan, Tx, claims, inbox, incidents, plausible, tasks};
 use crate::ids::{AttemptId, PlaceId, RobotId, TaskId};
 use crate::reason::{Code, Reason};
 use crate::robot::{FAULT_DISBELIEVED, Fault, FaultClass};
 use crate::site::Site;
 use crate::task::{Attempt, AttemptPhase, Event};
 use crate::time::Now;
-use crate::work::{Assignment, AttemptReport, Live, StepKind, WorkState, WorkStep};
+use crate::work::{AttemptReport, Effect, Live, StepKind, WorkState, WorkStep};
 
 /// The standing place where the step ends; none: it is no goto, or nothing is reserved there.
 fn goal<'s>(site: &'s Site, step: &WorkStep) -> Option<&'s PlaceId> {
@@ -54,10 +57,12 @@ pub fn note_standing(tx: &mut Tx, live: &Live) {
     }
 }
 
-/// Something that the robot said is lost: of its attempt nobody can tell any more where it was.
+/// Something that the robot said is lost: of its attempt nobody can tell any more where it was until now.
 pub fn lost(tx: &mut Tx, robot_id: &RobotId) {
-    if let Some(id) = tx.view.held_by(robot_id).cloned() {
-        lose(tx, &id);
+    let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
+    if let Some(been) = a.been.as_mut().filter(|been| !been.is_broken) {
+        been.is_broken = true;
+        tx.put(a, "attempt.changed");
     }
 }
 
@@ -82,43 +87,61 @@ fn may_end(a: &Attempt) -> bool {
     !a.phase.is_terminal() || a.phase == AttemptPhase::Lost
 }
 
-/// A place where the robot had to be for what it reports, and where it was not seen. None: it says nothing of an end that counts, it was at
-/// each of them, or that cannot be told.
+/// A place where the robot had to be for what it reports, and where it was not seen. None: its work is not over, it was at each of them, or
+/// that cannot be told.
 pub fn unseen(view: &View, now: &Now, robot_id: &RobotId, report: &AttemptReport) -> Option<PlaceId> {
     let id = &report.attempt;
-    let task_id = id.subject.task_id().filter(|_| report.state == WorkState::Succeeded)?;
+    let task_id = id.subject.task_id().filter(|_| report.state.is_over() && report.state != WorkState::Refused)?;
     let a = view.attempt(id).filter(|a| a.robot_id == *robot_id && may_end(a))?;
     let is_newest = view.task(task_id)?.attempt_id().as_ref() == Some(id);
     if !is_newest || plausible::judge(view, id, robot_id, report.state, report.step_index).is_some() {
         return None;
     }
+    let is_success = report.state == WorkState::Succeeded;
+    unproven(view, now, a, report.step_index, is_success).map(|(_, place_id)| place_id)
+}
+
+/// How far the attempt is for its task, if its robot says that so many steps are done: a step that must not be done twice counts as done,
+/// wherever its robot was, and so does what came before it.
+pub(super) fn proven(view: &View, now: &Now, a: &Attempt, steps: &[WorkStep], claimed: u32) -> u32 {
+    let Some((unseen, _)) = unproven(view, now, a, claimed, false) else { return claimed };
+    let irreversible = steps.iter().take(claimed as usize).rposition(|step| step.effect == Effect::AtMostOnce);
+    unseen.max(irreversible.map_or(0, |step| step as u32 + 1))
+}
+
+/// The first drive of the attempt among the first `claimed` steps that ends where its robot was not seen.
+fn unproven(view: &View, now: &Now, a: &Attempt, claimed: u32, is_success: bool) -> Option<(u32, PlaceId)> {
     let been = a.been.as_ref().filter(|_| !view.bugs.success_is_believed())?;
-    let ring = &view.sessions.get(robot_id.as_str())?.row.ring;
-    if *ring != been.ring || claims::is_ahead(view, robot_id, now) {
+    if claims::is_ahead(view, &a.robot_id, now) {
         return None;
     }
-    let is_unseen = |place: &&PlaceId| !been.places.contains(*place) && is_elsewhere(view, robot_id, place);
-    goals(view, a)?.into_iter().find(is_unseen).cloned()
-}
-
-/// Standing places that the attempt had to reach. Once it is taken back nobody knows where it began: then the last of them.
-fn goals<'v>(view: &'v View, a: &Attempt) -> Option<Vec<&'v PlaceId>> {
-    let site: &Site = &view.site;
-    let given = view.desired_work.get(a.robot_id.as_str()).and_then(|d| d.row.assignment.as_ref());
-    if let Some(given) = given.filter(|given| given.attempt == a.attempt) {
-        let begun_at = given.route.first().and_then(|point| point.standing.as_ref());
-        let due = given.steps.iter().enumerate().filter(|(step, _)| is_due(given, *step as u32)).map(|(_, step)| step);
-        let due = due.filter(|step| !step.continue_on_fail).filter_map(|step| goal(site, step));
-        return Some(due.filter(|place| begun_at != Some(*place)).collect());
+    let mut goals = goals(view, a, claimed)?;
+    let ring = &view.sessions.get(a.robot_id.as_str())?.row.ring;
+    if been.is_broken || *ring != been.ring {
+        let kept = goals.len().saturating_sub(usize::from(is_success));
+        goals.drain(..kept);
     }
-    let steps = &view.intake(a.attempt.subject.task_id()?)?.spec.steps;
-    let last = steps.iter().rfind(|step| matches!(step.kind, StepKind::Goto { .. }))?;
-    Some(goal(site, last).filter(|_| !last.continue_on_fail).into_iter().collect())
+    let is_unseen = |place: &PlaceId| !been.places.contains(place) && is_elsewhere(view, &a.robot_id, place);
+    let unseen = goals.into_iter().find(|(_, place)| is_unseen(place));
+    unseen.map(|(step, place)| (step, place.clone()))
 }
 
-/// The attempt does this step itself.
-fn is_due(given: &Assignment, step: u32) -> bool {
-    step == given.from_step || step >= given.resume_step
+/// Standing places that the attempt had to reach for the first `claimed` steps, each with its step. Once it is taken back nobody knows where
+/// it began: then those that its task is not past.
+fn goals<'v>(view: &'v View, a: &Attempt, claimed: u32) -> Option<Vec<(u32, &'v PlaceId)>> {
+    let given = view.desired_work.get(a.robot_id.as_str()).and_then(|d| d.row.assignment.as_ref());
+    let given = given.filter(|given| given.attempt == a.attempt);
+    let task_id = a.attempt.subject.task_id()?;
+    let (resume_step, steps) = match given {
+        Some(given) => (given.resume_step, &given.steps),
+        None => (view.task(task_id)?.next_step, &view.intake(task_id)?.spec.steps),
+    };
+    let begun = given.filter(|_| claimed > resume_step);
+    let is_due = |step: u32| (resume_step..claimed).contains(&step) || begun.is_some_and(|given| given.from_step == step);
+    let began_at = given.and_then(|given| given.route.first()?.standing.as_ref());
+    let due = (0..).zip(steps).filter(|(step, what)| is_due(*step) && !what.continue_on_fail);
+    let goals = due.filter_map(|(step, what)| Some((step, goal(&view.site, what)?)));
+    Some(goals.filter(|(_, place)| began_at != Some(*place)).collect())
 }
 
 /// The row of the place says that the robot is not inside of it now. One that this build cannot read says nothing.
@@ -127,11 +150,12 @@ fn is_elsewhere(view: &View, robot_id: &RobotId, place_id: &PlaceId) -> bool {
     place.is_some_and(|place| place.holder(robot_id).is_none_or(|holder| holder.state != HolderState::Inside))
 }
 
-/// An event says that the work is done and its robot was not seen there: the next heartbeat tells. What the event adds is taken.
+/// An event says that the work is over and its robot was not seen there: the next heartbeat tells. What the event adds is taken.
 pub fn wait(tx: &mut Tx, report: &AttemptReport) {
     let Some(mut a) = tx.view.attempt(&report.attempt).cloned() else { return };
     a.opened |= report.opened;
     a.stats = report.stats;
+    a.fault = report.fault.clone().or(a.fault);
     tx.put(a, "attempt.changed");
 }
 
@@ -143,17 +167,21 @@ pub fn disbelieve(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, place
     let fault = Some(Fault { code: FAULT_DISBELIEVED, class: FaultClass::Mechanical, message });
     // Of its word counts what it adds, and no step.
     let report = AttemptReport { step_index, fault, ..report.clone() };
-    let why = told(robot_id, task_id, place_id);
+    let why = told(tx.view, robot_id, &report, task_id, place_id);
     incidents::open_as(tx, incident_of(robot_id), why.clone(), Some(robot_id), Some(task_id));
     happen(tx, task_id, News { event: Event::FailedFinal, why: Some(&why), report: Some(&report) });
     inbox::release(tx, robot_id, &report);
 }
 
-fn told(robot_id: &RobotId, task_id: &TaskId, place_id: &PlaceId) -> Reason {
+fn told(view: &View, robot_id: &RobotId, report: &AttemptReport, task_id: &TaskId, place_id: &PlaceId) -> Reason {
+    let what = if report.state == WorkState::Succeeded { "" } else { "a part of " };
+    let is_canceled = view.task(task_id).is_some_and(tasks::wants_cancel);
+    let answer = format!(", then `midshift task resolve {task_id} --as ANSWER --reason TEXT`");
+    let answer = if is_canceled { "" } else { &answer };
     let text = format!(
-        "{robot_id} said that {task_id} is done and was never seen at {place_id} while it had it. Look there and where the \
-         item is, then `midshift task resolve {task_id}`. {robot_id} gets no work until its incident is closed: look at the \
-         robot, then `midshift incident close {} --reason TEXT`.",
+        "{robot_id} said that {what}{task_id} is done and was never seen at {place_id} while it had it. Look there and where \
+         the item is{answer}. {robot_id} gets no work until its incident is closed: look at the robot, then \
+         `midshift incident close {} --reason TEXT`.",
         incident_of(robot_id)
     );
     let reason = Reason::new(Code::GoalNotEntered, text).with("place_id", place_id);

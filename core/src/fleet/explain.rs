@@ -223,7 +223,7 @@ fn carries(view: &View, board: &Board, robot_id: &RobotId) -> Option<Reason> {
         }
         Some(task) => {
             let told = format!("The robot carries an item of task {}, which waits for a person's word.", task.task_id);
-            let resolve = format!("a person: midshift task resolve {}", task.task_id);
+            let resolve = format!("a person: midshift task resolve {} --as ANSWER --reason TEXT", task.task_id);
             Reason::new(Code::RobotLoaded, told).with("item", &load.item).with(WAITS_FOR, resolve)
         }
         None => load::explain_load(view, robot_id, load),

@@ -100,7 +100,7 @@ pub(super) fn may_settle(view: &View, board: &Board, now: &Now, robot_id: &Robot
     let Some(task) = opened else { return Ok(()) };
     let told = format!(
         "Task {0} is {1} and its item lies on {robot_id} as far as anybody knows: say first what became of it, with \
-         `midshift task resolve {0}` or `midshift task cancel {0}`.",
+         `midshift task resolve {0} --as ANSWER --reason TEXT` or `midshift task cancel {0}`.",
         task.task_id,
         task.phase.as_str()
     );

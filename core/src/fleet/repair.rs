@@ -163,25 +163,24 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
         step_index: listed.map_or(a.step_index, |l| l.step_index),
         opened: a.opened || listed.is_some_and(|l| l.opened),
         refusal: None,
-        fault: None,
+        fault: a.fault.clone(),
         stats: a.stats,
+    };
+    let mut is_over = |tx: &mut Tx, report: &AttemptReport| {
+        tally.repaired += 1;
+        match arrivals::unseen(tx.view, &tx.now, robot_id, report) {
+            Some(place_id) => arrivals::disbelieve(tx, robot_id, report, &place_id),
+            None => inbox::attempt(tx, robot_id, report, tally),
+        }
     };
     match listed {
         None => {
-            tally.repaired += 1;
             if is_unanswered(tx.view, &a, live) {
                 answers::missed(tx, robot_id);
             }
-            inbox::attempt(tx, robot_id, &report(WorkState::Aborted), tally);
+            is_over(tx, &report(WorkState::Aborted));
         }
-        Some(l) if l.state.is_over() && l.state != WorkState::Failed => {
-            tally.repaired += 1;
-            let report = report(l.state);
-            match arrivals::unseen(tx.view, &tx.now, robot_id, &report) {
-                Some(place_id) => arrivals::disbelieve(tx, robot_id, &report, &place_id),
-                None => inbox::attempt(tx, robot_id, &report, tally),
-            }
-        }
+        Some(l) if l.state.is_over() => is_over(tx, &report(l.state)),
         Some(l) if l.state == WorkState::StepUnknown => {
             let Some(task_id) = id.subject.task_id() else { return };
             tally.repaired += 1;

@@ -40,7 +40,7 @@ pub fn of_task(view: &View, board: &Board, now: &Now, task: &TaskState, intake: 
         }
         Phase::NeedsOperator => {
             let why = task.reason.clone().unwrap_or_else(|| Code::NotAllowedNow.into());
-            Some(why.with(WAITS_FOR, "a person: midshift task resolve"))
+            Some(why.with(WAITS_FOR, format!("a person: midshift task resolve {} --as ANSWER --reason TEXT", task.task_id)))
         }
         Phase::Suspended => task.reason.clone().map(|why| why.with(WAITS_FOR, "its return to the queue")),
         Phase::Held if !task.holds.is_empty() => task.holds.first().map(|token| held(Code::WaitingForHold, token)),
@@ -138,7 +138,7 @@ fn unknown(a: &Attempt, live: Option<&std::sync::Arc<Live>>) -> Option<Reason> {
             format!("a person at robot {robot_id}"),
             match a.attempt.subject.task_id() {
                 Some(_) => {
-                    "It is known again once the robot reports what can be; else answer with `midshift task resolve`."
+                    "It is known again once the robot reports what can be; else answer with `midshift task resolve TASK --as ANSWER --reason TEXT`."
                 }
                 None => {
                     "It is known again once the robot reports what can be; else look at its software and start it anew."

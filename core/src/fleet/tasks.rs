@@ -5,7 +5,7 @@
 
 use super::Tx;
 use super::rows::{HolderState, RobotAuthority, RobotCounter, RobotHolder, Timer, TimerKind};
-use super::{attempts, breaker, closures, plausible, screen};
+use super::{arrivals, attempts, breaker, closures, plausible, screen};
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -297,7 +297,8 @@ fn move_task(tx: &mut Tx, mut t: TaskState, a: Option<&Attempt>, step: Next, new
     }
     t.changed = tx.now.utc;
     if let Some(report) = news.report {
-        t.next_step = t.next_step.max(report.step_index);
+        let proven = a.map(|a| arrivals::proven(tx.view, &tx.now, a, &intake.spec.steps, report.step_index));
+        t.next_step = t.next_step.max(proven.unwrap_or(report.step_index));
         if report.opened {
             t.opened = t.robot_id.clone();
         }

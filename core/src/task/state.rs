@@ -256,6 +256,9 @@ pub struct Been {
     pub ring: String,
     /// Standing places at which a step is done and that it entered, or stood in already: at most one a step.
     pub places: BTreeSet<PlaceId>,
+    /// A part of what the robot said meanwhile is lost.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub is_broken: bool,
 }
 
 /// One grant of a task or errand to one robot.
