@@ -112,9 +112,6 @@ pub(super) fn proven(view: &View, now: &Now, a: &Attempt, steps: &[WorkStep], cl
 /// The first drive of the attempt among the first `claimed` steps that ends where its robot was not seen.
 fn unproven(view: &View, now: &Now, a: &Attempt, claimed: u32, is_success: bool) -> Option<(u32, PlaceId)> {
     let been = a.been.as_ref().filter(|_| !view.bugs.success_is_believed())?;
-    if claims::is_ahead(view, &a.robot_id, now) {
-        return None;
-    }
     let mut goals = goals(view, a, claimed)?;
     let ring = &view.sessions.get(a.robot_id.as_str())?.row.ring;
     if been.is_broken || *ring != been.ring {
@@ -123,7 +120,7 @@ fn unproven(view: &View, now: &Now, a: &Attempt, claimed: u32, is_success: bool)
     }
     let is_unseen = |place: &PlaceId| !been.places.contains(place) && is_elsewhere(view, &a.robot_id, place);
     let unseen = goals.into_iter().find(|(_, place)| is_unseen(place));
-    unseen.map(|(step, place)| (step, place.clone()))
+    unseen.filter(|_| !claims::is_ahead(view, &a.robot_id, now)).map(|(step, place)| (step, place.clone()))
 }
 
 /// Standing places that the attempt had to reach for the first `claimed` steps, each with its step. Once it is taken back nobody knows where
@@ -137,7 +134,8 @@ fn goals<'v>(view: &'v View, a: &Attempt, claimed: u32) -> Option<Vec<(u32, &'v 
         None => (view.task(task_id)?.next_step, &view.intake(task_id)?.spec.steps),
     };
     let begun = given.filter(|_| claimed > resume_step);
-    let is_due = |step: u32| (resume_step..claimed).contains(&step) || begun.is_some_and(|given| given.from_step == step);
+    let is_due =
+        |step: u32| (resume_step..claimed).contains(&step) || begun.is_some_and(|given| given.from_step == step);
     let began_at = given.and_then(|given| given.route.first()?.standing.as_ref());
     let due = (0..).zip(steps).filter(|(step, what)| is_due(*step) && !what.continue_on_fail);
     let goals = due.filter_map(|(step, what)| Some((step, goal(&view.site, what)?)));

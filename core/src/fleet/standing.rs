@@ -40,7 +40,12 @@ pub fn of_task(view: &View, board: &Board, now: &Now, task: &TaskState, intake: 
         }
         Phase::NeedsOperator => {
             let why = task.reason.clone().unwrap_or_else(|| Code::NotAllowedNow.into());
-            Some(why.with(WAITS_FOR, format!("a person: midshift task resolve {} --as ANSWER --reason TEXT", task.task_id)))
+            Some(
+                why.with(
+                    WAITS_FOR,
+                    format!("a person: midshift task resolve {} --as ANSWER --reason TEXT", task.task_id),
+                ),
+            )
         }
         Phase::Suspended => task.reason.clone().map(|why| why.with(WAITS_FOR, "its return to the queue")),
         Phase::Held if !task.holds.is_empty() => task.holds.first().map(|token| held(Code::WaitingForHold, token)),

@@ -11,7 +11,9 @@ use crate::robot::{FAULT_DISBELIEVED, Lane, WorkState};
 use crate::site::CORRIDOR;
 use crate::task::raw::RawStepKind;
 use crate::task::{AttemptPhase, Phase, RawTask};
-use crate::work::{AttemptReport, Effect, Gap, InboxEntry, InboxItem, PlaceNews, RobotEvent, Sample, SampleBody, WorkStats};
+use crate::work::{
+    AttemptReport, Effect, Gap, InboxEntry, InboxItem, PlaceNews, RobotEvent, Sample, SampleBody, WorkStats,
+};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -302,7 +304,11 @@ fn a_step_that_was_claimed_from_afar_is_not_done_unless_it_must_not_be_done_twic
         }
     };
     for (change, is_in_a, done) in [(true, false, 0), (true, true, 2), (false, false, 2)] {
-        let mut rig = given_at("park-a", |raw| if change { looks(raw) });
+        let mut rig = given_at("park-a", |raw| {
+            if change {
+                looks(raw)
+            }
+        });
         if is_in_a {
             is_in(&mut rig, &["A"]);
         }

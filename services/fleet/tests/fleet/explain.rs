@@ -208,7 +208,10 @@ async fn a_robot_with_an_item_of_a_task_that_needs_a_person_waits_for_that_word(
     w.pass(10).await;
     let told = of_robot(&w, "r1").await;
     let waits_for = told.metadata["waits_for"].as_str();
-    assert_eq!((told.code.as_str(), waits_for), ("ROBOT_LOADED", "a person: midshift task resolve T1 --as ANSWER --reason TEXT"));
+    assert_eq!(
+        (told.code.as_str(), waits_for),
+        ("ROBOT_LOADED", "a person: midshift task resolve T1 --as ANSWER --reason TEXT")
+    );
 }
 
 #[tokio::test(start_paused = true)]

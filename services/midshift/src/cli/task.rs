@@ -548,7 +548,10 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
         }
         let allowed = task.allowed_resolutions().filter_map(As::word).collect::<Vec<_>>().join(", ");
         if !allowed.is_empty() {
-            text += &format!("  a person may answer: midshift task resolve {} --as {allowed} --reason TEXT\n", task.task_id);
+            text += &format!(
+                "  a person may answer: midshift task resolve {} --as {allowed} --reason TEXT\n",
+                task.task_id
+            );
         }
         for attempt in &answer.attempts {
             let name = attempt.state().as_str_name().trim_start_matches("ATTEMPT_STATE_");
