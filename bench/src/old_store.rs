@@ -10,8 +10,8 @@ use crate::hall;
 use crate::offer::{Idle, one};
 use crate::submit::transports;
 use anyhow::{Context, ensure};
-use midshift::clock::wall;
 use midshift::storage::Database;
+use midshift_cli::clock::wall;
 use midshift_core::site::{Site, grid};
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::fleet::v1::{CordonRobotRequest, ExplainRobotRequest, ExplainTaskRequest, UncordonRobotRequest};
@@ -112,7 +112,7 @@ async fn rounds(args: &OldArgs, engine: &Engine, ended: u64, say: &dyn Fn(&str))
     let bed = engine.bed(args.engine.dir.as_ref())?;
     let map = hall::map(bed.path(), SIDE)?;
     let site = grid::parse_map("bench", &std::fs::read_to_string(&map)?)?;
-    let loaded = midshift::site_file::load(Some(&map), None, None)?;
+    let loaded = midshift_cli::site_file::load(Some(&map), None, None)?;
     if ended > 0 {
         let begun = Instant::now();
         let database = Database { store: bed.url().map(str::to_owned) };

@@ -44,7 +44,7 @@ pub struct SubmitArgs {
 /// Transports of the demo site.
 pub fn transports(site: &Site, count: usize) -> anyhow::Result<Vec<SubmitTaskRequest>> {
     let mut workload = Workload::new(WorkloadConfig::background(1), site).context("the site has no two stations")?;
-    Ok((0..count).map(|_| midshift::background::request(&workload.next_transport())).collect())
+    Ok((0..count).map(|_| midshift_cli::task_list::request(&workload.next_transport())).collect())
 }
 
 /// What one load on one server came to.

@@ -2,12 +2,12 @@
 
 use crate::child::Child;
 use anyhow::Context;
-use midshift::samples::{self, NAME, SAMPLES, Signer};
 use midshift_agent::trust::Trust;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::folder::Folder;
 use midshift_bundle::keys::{PublicKey, SecretKey};
 use midshift_bundle::repository::listed;
+use midshift_cli::samples::{self, NAME, SAMPLES, Signer};
 use midshift_core::ids::{BundleId, SiteId};
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::bundle_service_client::BundleServiceClient;
@@ -30,7 +30,7 @@ pub fn label(at: usize) -> String {
 impl People {
     /// Draws keys and signs the samples: settings only, which is all that simulated robots read.
     pub fn make(dir: &Path) -> anyhow::Result<Self> {
-        let made = samples::make(&dir.join("samples"), None, Signer::Throwaway, midshift::clock::wall())?;
+        let made = samples::make(&dir.join("samples"), None, Signer::Throwaway, midshift_cli::clock::wall())?;
         let id = |bytes: &[u8]| BundleId::parse(&Digest::of(bytes).to_string());
         let bundles = made.bundles.iter().map(|(_, manifest)| id(&manifest.to_bytes())).collect::<Result<_, _>>()?;
         Ok(Self { repository: made.repository, keys: made.keys.context("throw-away keys")?, bundles })

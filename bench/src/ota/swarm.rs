@@ -28,11 +28,11 @@ pub struct SwarmArgs {
 
 /// Runs all of them until `stop`: nothing goes wrong by itself, and no battery empties.
 pub async fn run(args: SwarmArgs, stop: CancellationToken) -> anyhow::Result<()> {
-    let site = midshift::site_file::load(Some(&args.site), None, None)?.site;
+    let site = midshift_cli::site_file::load(Some(&args.site), None, None)?.site;
     let clock: Arc<dyn Clock> = midshift::clock::clock(1000);
     let config = HallConfig { faults: FaultRates::none(), drains: false, ..HallConfig::new(site, args.robots, SEED) };
     let hall = Arc::new(Hall::open(&config, &clock.now())?);
-    let uri = midshift::way::uri(&args.server);
+    let uri = midshift_cli::way::uri(&args.server);
     let mut swarm = SwarmConfig::tcp(hall, clock, &uri, SEED);
     swarm.software = Some(Trust::read(&args.trust)?);
     Swarm::new(swarm).run(stop).await?;

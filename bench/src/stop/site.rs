@@ -3,8 +3,8 @@
 //! Invariant: made once for all robots of a run, before anything is measured; nothing of it runs then. Called by the parent; robots of children read theirs.
 
 use anyhow::Context;
-use midshift::way::Way;
 use midshift_agent::tls::{self, Tls};
+use midshift_cli::way::Way;
 use midshift_core::ids::SiteId;
 use midshift_core::time::Clock;
 use midshift_identity::{Duty, IdentityService, Parts};

@@ -22,3 +22,6 @@ pub use revocation::{Revocation, revocations};
 pub use rows::{Act, Authority, Rotation, ServerCertificate, TokenName, TokenRecord};
 pub use session::SessionSecret;
 pub use token::{Digest, Secret, TokenId};
+
+/// The folder of a server's keys and certificates, below its data folder.
+pub const FOLDER: &str = "identity";

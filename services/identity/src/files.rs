@@ -8,8 +8,7 @@ use std::io::{self, Read};
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::Path;
 
-/// The folder of a server's keys and certificates, below its data folder.
-pub const FOLDER: &str = "identity";
+pub use midshift_core::identity::FOLDER;
 
 /// Owner alone.
 pub const PRIVATE: u32 = midshift_durable::PRIVATE;

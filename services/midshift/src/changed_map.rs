@@ -2,8 +2,8 @@
 //!
 //! Called by `serve`, and by `dev` for data that it keeps, before any service begins. Invariant: nothing is written here; fleet tells people, and stores the map that is taken.
 
-use crate::site_file::Loaded;
 use anyhow::Context;
+use midshift_cli::site_file::Loaded;
 use midshift_core::fleet::maps::{MapChange, in_the_way};
 use midshift_core::fleet::rows::SiteRow;
 use midshift_core::fleet::view::{View, alive, named};

@@ -1,22 +1,16 @@
 //! The process' clocks: tokio's monotonic clock, so that a simulation can own it, and the wall's UTC, read whenever the time is asked for.
 
+use midshift_cli::clock::wall;
 use midshift_core::time::{Clock, Jump, ScaledClock, Utc};
 use midshift_core::wall::WallClock;
 use std::fs;
 use std::sync::Arc;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::UNIX_EPOCH;
 use tokio::time::Instant;
 
 /// systemd touches it when the clock of the machine was set from the network. The kernel is not asked: the system call filter of our own unit ends a
 /// process that calls adjtimex, also one that only reads.
 const SYNCED: &str = "/run/systemd/timesync/synchronized";
-
-/// UTC of the machine, unix ms.
-#[expect(clippy::disallowed_methods, reason = "the one place where the machine's wall clock is read")]
-pub fn wall() -> Utc {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    Utc(i64::try_from(since.as_millis()).unwrap_or(i64::MAX))
-}
 
 /// Clocks that start now; the site clock runs `rate_permille` thousandths of real time. One that is not real is a simulation's own, with its wall.
 pub fn clock(rate_permille: u32) -> Arc<dyn Clock> {

@@ -4,18 +4,17 @@
 //! each process that shares the folder. In one without a doubt it accepts nothing later.
 
 use anyhow::Context;
+use midshift_cli::clock::ACCEPTED;
 use midshift_core::audit::Note;
 use midshift_core::rows::{Item, Log, Seq, Table, Writer};
 use midshift_core::time::{Clock, Now, Utc};
 use midshift_store::{Error, Store};
 use std::fs;
 use std::io::ErrorKind;
-use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::time::{Duration, SystemTime};
 
-/// File of the data folder.
-const FILE: &str = "clock-accepted";
 /// File of the data folder: the newest time that was in no doubt, unix ms.
 const BELIEVED: &str = "clock-believed";
 /// It is written anew when the clock is so far from it, milliseconds: much less than what puts a start in doubt.
@@ -28,18 +27,6 @@ const LOOK_EVERY: Duration = Duration::from_secs(2);
 const LOOKS: u32 = 5;
 /// Entries of the log that are looked at for the newest time of the store.
 const ENTRIES: usize = 64;
-
-/// Leaves the word for the server of `data`.
-///
-/// # Errors
-/// The disk.
-pub fn leave_word(data: &Path) -> anyhow::Result<()> {
-    let path = data.join(FILE);
-    let by = format!("os:{}", rustix::process::getuid().as_raw());
-    midshift_durable::replace(&path, by.as_bytes()).with_context(|| format!("writing {}", path.display()))?;
-    // Whoever says it may be another user than the server; the data folder is closed to others.
-    fs::set_permissions(&path, fs::Permissions::from_mode(0o644)).with_context(|| format!("opening {}", path.display()))
-}
 
 /// Holds the clock of a start against the newest time that the store has, and that was in no doubt.
 ///
@@ -127,7 +114,7 @@ fn take_away(path: &Path, read: &mut Read) -> anyhow::Result<()> {
 }
 
 async fn take_word(data: &Path, clock: &dyn Clock, store: &dyn Store, read: &mut Read) -> anyhow::Result<()> {
-    let path = data.join(FILE);
+    let path = data.join(ACCEPTED);
     let reading = || format!("reading {}", path.display());
     let word = match fs::metadata(&path) {
         Ok(file) => Some((file.ino(), file.modified().with_context(reading)?)),
@@ -153,6 +140,7 @@ async fn take_word(data: &Path, clock: &dyn Clock, store: &dyn Store, read: &mut
 #[cfg(test)]
 mod tests {
     use super::*;
+    use midshift_cli::clock::leave_word;
     use midshift_core::audit::AuditRow;
     use midshift_core::ids::SiteId;
     use midshift_core::rows::Fact;

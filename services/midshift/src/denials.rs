@@ -2,7 +2,7 @@
 //!
 //! Invariant: the port never waits for this. What cannot be written is counted, and said once; how many are written at most is the port's to say.
 
-use crate::roles::Role;
+use midshift_cli::roles::Role;
 use midshift_core::audit::Note;
 use midshift_core::rows::{Item, Writer};
 use midshift_edge::Denial;

@@ -1,13 +1,11 @@
 //! `midshift dev`: a whole factory in one process, in memory, on loopback, with simulated robots and work of its own. Not for production.
 
-use crate::background::{Acknowledged, Background, Pressure, Source, all_stand, read_list};
+use crate::background::{Acknowledged, Background, Pressure, Source, all_stand};
 use crate::planning::Planning;
 use crate::report::{self, Inputs, Kind, Report};
-use crate::roles::Roles;
 use crate::scenario::{self, Launched, Release, Scenario, Sight, Stage, Story};
 use crate::serve::{self, Say};
 use crate::server::{Naive, Parts, Server};
-use crate::site_file::{self, Loaded};
 use crate::stop::{self, Beside};
 use crate::tally::{self, SharedTasks, Tasks};
 use crate::throwaway::Throwaway;
@@ -16,6 +14,9 @@ use crate::{changed_map, clock, clock_doubt, door, resuming, stop_follower};
 use anyhow::{Context, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_agent::trust::Trust;
+use midshift_cli::roles::Roles;
+use midshift_cli::site_file::{self, Loaded};
+use midshift_cli::task_list::read_list;
 use midshift_core::site::{Site, grid};
 use midshift_core::task::Phase;
 use midshift_core::time::{Clock, SiteTime};
@@ -68,7 +69,7 @@ pub struct Dev {
     /// Good is: no place ever too full, no item lost or doubled, no step done twice, every task accounted for, and at most twice the
     /// robots' number of tasks open (unless --keep-open or --rate). From 5m on also: at most 2 % of the tasks, or one, with an operator;
     /// and 8 tasks a robot succeeded in 10m, in the built-in factory with its own work and up to 20 robots.
-    #[arg(long = "for", value_parser = crate::duration::duration)]
+    #[arg(long = "for", value_parser = midshift_cli::duration)]
     pub run_for: Option<Duration>,
     /// Keep everything in this directory instead of in memory.
     #[arg(long)]
@@ -101,7 +102,7 @@ pub struct Dev {
     )]
     pub bundles: Vec<Release>,
     /// How long the story's roll-outs keep a robot on probation and let a wave soak, e.g. 3s.
-    #[arg(long, value_parser = crate::duration::duration, requires = "scenario", default_value = "10s")]
+    #[arg(long, value_parser = midshift_cli::duration, requires = "scenario", default_value = "10s")]
     pub watched: Duration,
     /// Nothing goes wrong by itself. What is bad only with a load makes such faults more frequent, so a story does without that bundle then.
     #[arg(long)]

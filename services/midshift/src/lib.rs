@@ -1,18 +1,17 @@
-//! The midshift binary as a library: wiring of services, `dev`, `serve`, robots in processes, and the operator's command line.
+//! The midshift binary as a library: wiring of services, `dev`, `serve`, robots in processes, and the commands that start them.
 //!
 //! Called by `main.rs`, by the tests and by the benchmarks. Only here are configuration, environment and the machine's clock read.
 
 pub mod background;
 pub mod backup;
 mod changed_map;
-pub mod cli;
 pub mod clock;
 pub mod clock_doubt;
 mod clock_jump;
+pub mod commands;
 mod denials;
 pub mod dev;
 pub mod door;
-pub mod duration;
 pub mod logs;
 pub mod machines;
 mod parts;
@@ -21,13 +20,9 @@ pub mod recorder;
 pub mod report;
 mod resuming;
 pub mod robots;
-pub mod roles;
-pub mod samples;
 pub mod scenario;
 pub mod serve;
 pub mod server;
-mod site_answer;
-pub mod site_file;
 mod software;
 pub mod stop;
 pub mod stop_follower;
@@ -36,7 +31,6 @@ pub mod tally;
 pub mod throwaway;
 pub mod under_way;
 mod upkeep;
-pub mod way;
 
 #[cfg(test)]
 #[path = "../../../tests/src/postgres.rs"]

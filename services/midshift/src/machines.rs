@@ -2,13 +2,13 @@
 //!
 //! Invariant: what a simulated robot shows is what a real one would: the server makes no difference.
 
-use crate::way::Way;
 use anyhow::Context;
 use midshift_agent::device::{self, DeviceKey};
 use midshift_agent::dial::TcpDial;
 use midshift_agent::enrolment::{Enrolled, Identity, Invitation};
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::tls::Tls;
+use midshift_cli::way::Way;
 use midshift_core::ids::RobotId;
 use midshift_core::time::Clock;
 use midshift_proto::identity::v1::CreateEnrolmentRequest;
@@ -71,7 +71,7 @@ impl Machines {
 }
 
 async fn machine(
-    mut client: IdentityServiceClient<crate::way::Line>,
+    mut client: IdentityServiceClient<midshift_cli::way::Line>,
     server: &str,
     robot_id: &RobotId,
     folder: Option<PathBuf>,

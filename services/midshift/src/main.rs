@@ -3,5 +3,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    midshift::cli::main()
+    midshift::commands::main()
 }

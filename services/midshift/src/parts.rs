@@ -1,6 +1,6 @@
 //! What a server is built from.
 
-use crate::roles::Roles;
+use midshift_cli::roles::Roles;
 use midshift_core::fleet::maps::MapChange;
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, Utc};

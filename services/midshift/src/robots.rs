@@ -1,10 +1,9 @@
 //! Robots in processes of their own: one agent with a simulated body that survives its process, or a swarm against a server elsewhere.
 
+use crate::clock;
 use crate::door;
 use crate::machines::Machines;
 use crate::software::{self, Software};
-use crate::way::{Way, with_scheme};
-use crate::{clock, site_file, stop};
 use anyhow::{Context, bail};
 use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
@@ -15,6 +14,9 @@ use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::stop::keep::{FileStops, STOP_FILE};
 use midshift_agent::stop::line::StopLine;
 use midshift_agent::store::Store;
+use midshift_cli::enrol::ENROLL;
+use midshift_cli::way::{Way, with_scheme};
+use midshift_cli::{site_file, stop_service};
 use midshift_core::ids::{RobotId, WaypointId};
 use midshift_core::time::Clock;
 use midshift_sim::body::{BodyConfig, SimBody};
@@ -68,7 +70,7 @@ impl IdentityFlags {
 impl StopFlags {
     /// Where the stop service is for robots of the server at `server`, over TLS or not; none: there is to be no line, which is said aloud.
     fn address(&self, server: &str, is_secure: bool) -> Option<String> {
-        let beside = || is_secure.then(|| stop::beside(server)).flatten();
+        let beside = || is_secure.then(|| stop_service::beside(server)).flatten();
         let address = if self.no_stop { None } else { self.stop_server.clone().or_else(beside) };
         match &address {
             Some(address) => {
@@ -176,9 +178,6 @@ pub struct SimRun {
     #[command(flatten)]
     pub stop: StopFlags,
 }
-
-/// Variable with the secret that enrols a robot.
-pub const ENROLL: &str = "MIDSHIFT_ENROLL";
 
 /// What this machine was given to enrol with; none: nothing.
 fn invitation(file: Option<&Path>) -> Result<Option<Invitation>, enrolment::Error> {

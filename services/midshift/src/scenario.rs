@@ -10,10 +10,10 @@ mod watch;
 
 pub use played::Story;
 
-use crate::samples::{self, Signer};
 use anyhow::{Context, ensure};
 use midshift_agent::switch::Switch;
 use midshift_agent::trust::Trust;
+use midshift_cli::samples::{self, Signer};
 use midshift_core::ids::{AreaId, RobotId, WaypointId};
 use midshift_proto::fleet::v1::GetAreaPolicyRequest;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;

@@ -3,14 +3,15 @@
 
 use crate::door::{self, Share};
 use crate::planning::Planning;
-use crate::roles::{Role, Roles};
 use crate::server::{Naive, Parts, Server};
 use crate::storage::{Database, Storage};
 use crate::{backup, changed_map};
-use crate::{clock, clock_doubt, clock_jump, logs, site_file, stop, stop_follower};
+use crate::{clock, clock_doubt, clock_jump, logs, stop, stop_follower};
 use anyhow::{Context, bail};
 use clap::ValueEnum;
 use midshift_agent::tls;
+use midshift_cli::roles::{Role, Roles};
+use midshift_cli::site_file;
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_identity::{Duty, IdentityService};

@@ -7,14 +7,14 @@
 
 use crate::door::{self, Login};
 pub use crate::parts::{Naive, Parts};
-use crate::roles::Role;
-use crate::site_answer::SiteAnswer;
 use crate::stop_follower::StopFollower;
 use crate::upkeep;
 use crate::{denials, recorder};
 use anyhow::{Context, bail};
 use axum::routing::get;
 use http::StatusCode;
+use midshift_cli::roles::Role;
+use midshift_cli::site_answer::SiteAnswer;
 use midshift_core::limits;
 use midshift_core::work::Live;
 use midshift_edge::{Denials, Listen};
@@ -431,9 +431,10 @@ mod frames;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::clock;
     use crate::planning::Planning;
-    use crate::roles::Roles;
-    use crate::{clock, site_file};
+    use midshift_cli::roles::Roles;
+    use midshift_cli::site_file;
     use midshift_ota::OtaService;
     use midshift_store::{MemoryFrames, MemoryStore, StoreId};
     use tokio::net::TcpListener;

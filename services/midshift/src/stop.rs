@@ -11,14 +11,14 @@ mod program;
 mod started;
 
 pub use first_start::{Occasion, announce};
-pub use program::FOLDER;
+pub use midshift_cli::stop_service::{FOLDER, PORT};
 pub use started::{LOG, Started};
 
 use crate::door::{self, Login, Share};
-use crate::way::uri;
-use crate::{clock, recorder, site_file};
+use crate::{clock, recorder};
 use anyhow::{Context, bail, ensure};
 use axum::routing::get;
+use midshift_cli::site_file;
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, LinkDuration, Utc};
 use midshift_edge::{Config, Denial, Denials};
@@ -36,8 +36,6 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
 
-/// Its port, beside the 7420 of the business.
-pub const PORT: u16 = 7421;
 /// As metrics and logs name it.
 const PORT_NAME: &str = "stop";
 /// How often one that follows looks whether the folder is free: nobody is answered meanwhile.
@@ -46,17 +44,6 @@ const NEXT_EVERY: Duration = Duration::from_millis(10);
 const KEEPALIVE_EVERY: LinkDuration = LinkDuration::from_secs(10);
 /// How often it is looked whether somebody else is known: with the writer's own second, two after a revocation at the latest.
 const PRINCIPALS_EVERY: Duration = Duration::from_millis(500);
-
-/// The stop service on the host of a server: host:port. None: `server` names no host.
-pub fn beside(server: &str) -> Option<String> {
-    beside_on(server, PORT)
-}
-
-/// The same where it has another port.
-pub fn beside_on(server: &str, port: u16) -> Option<String> {
-    let uri: http::Uri = uri(server).parse().ok()?;
-    Some(format!("{}:{port}", uri.host()?))
-}
 
 /// What `stop serve` was asked for.
 #[derive(Clone, Debug, clap::Args)]

@@ -7,8 +7,8 @@ mod oldest;
 
 use crate::parts::Parts;
 use crate::recorder;
-use crate::roles::Role;
 use metrics_exporter_prometheus::PrometheusHandle;
+use midshift_cli::roles::Role;
 use midshift_core::fleet::rows::FleetMark;
 use midshift_core::limits;
 use midshift_core::privacy::Retention;

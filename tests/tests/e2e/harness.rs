@@ -3,7 +3,7 @@
 use crate::engine::fresh_store;
 use crate::secrets::{keep_keys, keep_secret, secret_part, told_by_log};
 use anyhow::{Context, bail, ensure};
-use midshift::way::{Line, Way};
+use midshift_cli::way::{Line, Way};
 use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::identity::v1::CreateTokenRequest;
 use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient;

@@ -3,8 +3,8 @@
 
 use crate::harness::{Server, in_states, tasks, until};
 use crate::robots::{Robots, with_robots};
-use midshift::background::request;
 use midshift_agent::ledger::Holder;
+use midshift_cli::task_list::request;
 use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::task::v1::{SubmitTasksRequest, Task, TaskState};
 use midshift_sim::oracle::Oracle;

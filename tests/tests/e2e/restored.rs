@@ -4,7 +4,7 @@ use crate::harness::{Server, command, until};
 use crate::robots::{Robots, with_robots};
 use crate::secrets::heard;
 use crate::stopped::{StopServer, resume, until_held};
-use midshift::background::request;
+use midshift_cli::task_list::request;
 use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::task::v1::submit_task_result::Outcome;
 use midshift_proto::task::v1::{SubmitTasksRequest, TaskState};

@@ -4,7 +4,6 @@
 use anyhow::Context;
 use async_trait::async_trait;
 use hyper_util::rt::TokioIo;
-use midshift::samples::{self, Made, Signer};
 use midshift_agent::dial::{self, Cut, Dial};
 use midshift_agent::trust::Trust;
 use midshift_bundle::build;
@@ -15,6 +14,7 @@ use midshift_bundle::installed;
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::repository::{Profile, listed};
 use midshift_bundle::ways::Way;
+use midshift_cli::samples::{self, Made, Signer};
 use midshift_core::authority::Authority;
 use midshift_core::ids::{DrainId, SetId};
 use midshift_core::reason::Code;

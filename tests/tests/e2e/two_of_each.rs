@@ -8,7 +8,7 @@ use crate::room::LIMIT;
 use crate::split::events_have_no_hole;
 use crate::stack::Stack;
 use anyhow::{Context, ensure};
-use midshift::background::request;
+use midshift_cli::task_list::request;
 use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::fleet::v1::{

@@ -2,7 +2,7 @@
 
 use crate::clock::Skew;
 use crate::software::{BAD_AT_START, BAD_WITH_LOAD, GOOD, HANGS};
-use midshift::background::request;
+use midshift_cli::task_list::request;
 use midshift_core::site::Site;
 use midshift_proto::task::v1::SubmitTaskRequest;
 use midshift_sim::workload::{Workload, WorkloadConfig};

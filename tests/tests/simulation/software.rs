@@ -3,12 +3,12 @@
 //! Invariant: nothing is drawn and no wall clock is read, so that the same seed signs the same directives.
 
 use anyhow::Context;
-use midshift::samples::{NAME, SAMPLES};
 use midshift_agent::trust::Trust;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::keys::{PublicKey, SecretKey};
 use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest};
 use midshift_bundle::repository::{FileTarget, PEOPLE_LIFE_MS, RootDraft, Signers, sign_root, sign_targets};
+use midshift_cli::samples::{NAME, SAMPLES};
 use midshift_core::ids::{BundleId, SiteId};
 use midshift_core::limits;
 use midshift_core::time::{Clock, Utc};

@@ -44,7 +44,7 @@ impl Floor {
     pub fn make(dir: Option<&PathBuf>, robots: usize) -> anyhow::Result<Self> {
         let dir = place(dir)?;
         let map = crate::hall::map(dir.path(), (robots as f64).sqrt() as usize + 2)?;
-        let site = midshift::site_file::load(Some(&map), None, None)?.site;
+        let site = midshift_cli::site_file::load(Some(&map), None, None)?.site;
         let people = People::make(dir.path())?;
         // A server that is started again listens where its robots look for it.
         let address = TcpListener::bind("127.0.0.1:0")?.local_addr()?;
@@ -135,7 +135,7 @@ impl Rows {
     pub fn check(&self, people: &People, robots: usize, hearers: &mut Child) -> anyhow::Result<()> {
         ensure!(self.desired.len() == robots && self.robots.len() == robots, "rows are missing");
         let key = people.directive_key()?;
-        let (keys, now) = ([(key.id(), key)].into(), midshift::clock::wall());
+        let (keys, now) = ([(key.id(), key)].into(), midshift_cli::clock::wall());
         for ((desired, revision), robot) in self.desired.iter().zip(&self.robots) {
             let id = &desired.robot_id;
             ensure!(*id == robot.robot_id && *revision == Revision(1), "{id} was assigned {} times", revision.0);

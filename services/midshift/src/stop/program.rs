@@ -1,11 +1,9 @@
-//! The program of a stop service as others start it: which one that is, where its files are, and how long it may take until it answers.
+//! The program of a stop service as others start it: which one that is, and how long it may take until it answers.
 
 use anyhow::Context;
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// The folder of its files below the data folder.
-pub const FOLDER: &str = "stop";
 /// A stop service that was started answers within this, or `serve` says that it did not.
 pub(super) const UP_WITHIN: Duration = Duration::from_secs(10);
 /// How often it is looked whether it does.

@@ -1,0 +1,98 @@
+//! `midshift stop …`: runs the stop service, checks its files, or asks one that runs.
+
+use crate::stop::{FOLDER, StopServe};
+use clap::{Args, Subcommand};
+use midshift_cli::Command;
+use midshift_cli::client::Exit;
+use midshift_cli::out::{Format, Out};
+use midshift_cli::stop::{self, Engage, Request};
+use std::path::{Path, PathBuf};
+use tokio_util::sync::CancellationToken;
+
+/// Stops robots, at once and without asking back: an operational stop request; not a safety function, no performance level; the independent emergency stop is the robot
+/// maker's and the integrator's hardware.
+///
+/// A stop stays until it is reset by its name; a reset makes nothing move. Exit code 13: not every robot has confirmed.
+#[derive(Args)]
+#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
+pub struct Stop {
+    #[command(subcommand)]
+    verb: Option<Verb>,
+    #[command(flatten)]
+    engage: Engage,
+}
+
+/// What is done with stops besides engaging them.
+#[derive(Subcommand)]
+enum Verb {
+    /// Ask the stop service that runs.
+    #[command(flatten)]
+    Ask(stop::Verb),
+    /// Check that nobody has changed the audit of stops. Exit code 1 if somebody has.
+    Verify {
+        /// The data folder of the stop service, on this machine.
+        #[arg(long, default_value = "midshift-data")]
+        data: PathBuf,
+    },
+    /// Run the stop service: a process of its own beside `midshift serve`, with its own port and files.
+    Serve(StopServe),
+}
+
+impl Stop {
+    /// What to serve, if that is what was asked for.
+    pub fn serves(&self) -> Option<&StopServe> {
+        match &self.verb {
+            Some(Verb::Serve(args)) => Some(args),
+            _ => None,
+        }
+    }
+}
+
+/// Runs one verb.
+pub async fn run(stop: Stop, out: &Out, shutdown: CancellationToken) -> Result<(), Exit> {
+    let request = match stop.verb {
+        None => Request::Engage(stop.engage),
+        Some(Verb::Ask(verb)) => Request::Of(verb),
+        Some(Verb::Verify { data }) => return verify(&data.join(FOLDER), out),
+        Some(Verb::Serve(args)) => return Ok(crate::stop::run(args, shutdown).await?),
+    };
+    midshift_cli::run(Command::Stop(Box::new(request)), out).await
+}
+
+fn verify(folder: &Path, out: &Out) -> Result<(), Exit> {
+    let verified = midshift_stop::verify(folder).map_err(|broken| {
+        Exit::new(1, format!("{}: {broken}\n  try: compare it with a backup", folder.join("audit.jsonl").display()))
+    })?;
+    match out.format {
+        Format::Table => {
+            out.line(&format!("{} records hold together, the last is {}", verified.records, verified.hash))
+        }
+        Format::Name => out.line(&verified.hash),
+        Format::Json | Format::Jsonl => {
+            out.value(&serde_json::json!({"records": verified.records, "hash": verified.hash}))?;
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        stop: Stop,
+    }
+
+    #[test]
+    fn verbs_need_nobody_to_stop() {
+        let parse = |words: &str| Line::try_parse_from(["stop"].into_iter().chain(words.split_whitespace()));
+        assert!(parse("--all --reason drill").is_ok_and(|line| line.stop.verb.is_none()));
+        let watches = |line: Line| matches!(line.stop.verb, Some(Verb::Ask(stop::Verb::Status { watch: true, .. })));
+        assert!(parse("status --watch").is_ok_and(watches));
+        assert!(parse("serve").is_ok_and(|line| line.stop.serves().is_some()));
+        assert!(parse("").is_err() && parse("--all status").is_err());
+    }
+}
