@@ -13,6 +13,7 @@ mod go;
 mod images;
 mod parts;
 mod run;
+mod slowest;
 mod stack;
 mod suite;
 mod sweep;

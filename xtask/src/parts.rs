@@ -4,12 +4,16 @@
 //! are the same in each and nothing is compiled twice.
 
 use crate::fetch_tools::Tools;
+use crate::slowest::Slowest;
 use crate::stack::{self, Which};
 use crate::workspace::Workspace;
 use crate::{clients, dist, docker, engine, run};
 use anyhow::Result;
 use clap::ValueEnum;
 use std::process::Command;
+
+/// Tests that are named after a part of tests.
+const SLOWEST_NAMED: usize = 10;
 
 /// One part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
@@ -131,9 +135,7 @@ fn tests(workspace: &Workspace, tools: Option<&Tools>, targets: &[&str]) -> Resu
     let mut command = workspace.cargo(&["test", "--workspace", "--no-fail-fast"]);
     // What failed is said in a line; a hundred lines of where it was hide it.
     command.args(targets).env("RUST_BACKTRACE", "0");
-    // Most of them wait for programs that they started: two tests a core keep the cores busy.
-    let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
-    command.env("RUST_TEST_THREADS", (2 * cores).to_string());
+    command.env("RUST_TEST_THREADS", threads().to_string());
     workspace.export_programs(&mut command)?;
     if let Some(tools) = tools {
         tools.export(&mut command);
@@ -142,10 +144,25 @@ fn tests(workspace: &Workspace, tools: Option<&Tools>, targets: &[&str]) -> Resu
     Ok(command)
 }
 
+/// Tests that run at once. Most of them wait for programs that they started: two tests a core keep the cores busy.
+fn threads() -> usize {
+    2 * std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
+}
+
 impl Count {
-    /// Runs test programs to the end and adds theirs up; whether all succeeded.
+    /// Runs test programs to the end, adds theirs up, and names the slowest tests; whether all succeeded.
+    #[expect(clippy::disallowed_methods, reason = "seconds of the tests by the wall, for a person")]
     fn all(&mut self, tests: &mut Command) -> Result<bool> {
-        run::reading(tests, |line| self.add(line))
+        let begun = std::time::Instant::now();
+        let mut slowest = Slowest::new(threads());
+        let passed = run::reading(tests, |line| {
+            self.add(line);
+            slowest.add(line, begun.elapsed());
+        });
+        let list = slowest.list(SLOWEST_NAMED);
+        let lines: Vec<_> = list.iter().map(|(took, name)| format!("{:>6.1} s  {name}", took.as_secs_f64())).collect();
+        run::say(&format!("the slowest tests:\n{}", lines.join("\n")));
+        passed
     }
 
     /// A part that is one test.
