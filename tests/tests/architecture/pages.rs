@@ -1,0 +1,140 @@
+//! Pages for people: how long they may be, where their links lead, and that what they show as printed is printed.
+
+use crate::{files, read, root};
+use std::path::Path;
+
+/// Longest line, in characters; of a table it is what its cells need.
+const LINE_MAX: usize = 120;
+/// Pages whose lines are held to it.
+const HELD: [&str; 12] = [
+    "README.md",
+    "ARCHITECTURE.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+    "STYLE.md",
+    "docs/cli.md",
+    "docs/numbers.md",
+    "docs/questions.md",
+    "docs/run-a-floor.md",
+    "docs/send-orders.md",
+    "docs/sites.md",
+];
+/// Most words of a page that everybody reads.
+const WORDS: [(&str, usize); 2] = [("README.md", 1_500), ("ARCHITECTURE.md", 2_500)];
+/// What entries of the changelog stand under, in this order.
+const GROUPS: [&str; 4] = ["### Added", "### Changed", "### Fixed", "### Upgrading"];
+const ENTRY_LINES_MAX: usize = 2;
+
+/// Names of README's floor, which has more than two places, and what the transcript of the command line calls the same.
+const NAMES: [(&str, &str); 4] = [("A01", "A"), ("B03", "B"), ("TASK-1", "TASK-5"), ("rbt-04", "rbt-01")];
+
+/// Lines that are longer than people read, by number.
+fn long_lines(page: &str) -> Vec<usize> {
+    let long = page.lines().enumerate().filter(|(_, line)| !line.starts_with('|') && line.chars().count() > LINE_MAX);
+    long.map(|(n, _)| n + 1).collect()
+}
+
+#[test]
+fn pages_are_no_longer_than_people_read() {
+    for path in HELD {
+        assert_eq!(long_lines(&read(path)), Vec::<usize>::new(), "{path}");
+    }
+    for (path, most) in WORDS {
+        let words = read(path).split_whitespace().count();
+        assert!(words <= most, "{path} has {words} words; {most} are read");
+    }
+    assert_eq!(long_lines(&format!("# A\n{}\n| {} |\n", "a".repeat(121), "a".repeat(121))), [2]);
+}
+
+/// What is wrong with a changelog.
+fn misplaced(page: &str) -> Vec<String> {
+    let mut wrong = Vec::new();
+    let (mut group, mut lines) = (None, 0);
+    for line in page.lines() {
+        if line.starts_with("## ") {
+            (group, lines) = (None, 0);
+        } else if line.starts_with("### ") {
+            let at = GROUPS.iter().position(|known| *known == line);
+            if at.is_none() || at <= group {
+                wrong.push(line.to_owned());
+            }
+            group = at;
+        } else if line.starts_with("- ") {
+            lines = 1;
+            if group.is_none() {
+                wrong.push(line.to_owned());
+            }
+        } else if line.starts_with("  ") {
+            lines += 1;
+            if lines > ENTRY_LINES_MAX {
+                wrong.push(line.to_owned());
+            }
+        }
+    }
+    wrong
+}
+
+#[test]
+fn an_entry_of_the_changelog_is_short_and_stands_in_its_group() {
+    assert_eq!(misplaced(&read("CHANGELOG.md")), Vec::<String>::new());
+    let bad = "## 1\n- a\n### Fixed\n- b\n  b\n  b\n### Added\n- c\n### Gone\n";
+    assert_eq!(misplaced(bad), ["- a", "  b", "### Added", "### Gone"]);
+}
+
+/// Where links of a page lead, files only.
+fn links(page: &str) -> Vec<&str> {
+    let targets = page.split("](").skip(1).filter_map(|rest| rest.split_once(')').map(|(target, _)| target));
+    let files = targets.map(|target| target.split('#').next().unwrap_or_default());
+    files.filter(|target| !target.is_empty() && !target.contains("://") && !target.contains(' ')).collect()
+}
+
+#[test]
+fn every_link_of_a_page_leads_to_a_file_or_folder() {
+    let mut seen = 0;
+    for path in files("", "md").into_iter().filter(|path| !path.contains("node_modules")) {
+        let folder = root().join(&path).parent().map(Path::to_owned).unwrap_or_default();
+        let page = read(&path);
+        for target in links(&page) {
+            seen += 1;
+            assert!(folder.join(target).exists(), "{path} leads to {target}");
+        }
+    }
+    assert!(seen > 100, "only {seen} links found");
+    assert_eq!(links("[a](docs/a.md#b) [b](#c) [c](https://x.y) `f[0](1 2)`"), ["docs/a.md"]);
+}
+
+/// Words of a line with one space between them.
+fn spaced(line: &str) -> String {
+    line.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// Parts of the lines that a page shows as printed: what stands in a block of a console, not behind `$`, between the signs that something is left out.
+fn printed(page: &str) -> Vec<String> {
+    let mut is_console = false;
+    let mut found = Vec::new();
+    for line in page.lines() {
+        if line.starts_with("```") {
+            is_console = line == "```console";
+        } else if is_console && !line.starts_with("$ ") {
+            let line = line.trim_start_matches("next: ").trim_start_matches("error: ");
+            found.extend(line.split('…').map(spaced).filter(|part| !part.is_empty()));
+        }
+    }
+    found
+}
+
+#[test]
+fn what_the_readme_shows_as_printed_stands_in_the_transcript_or_in_a_test() {
+    let mut known = read("tests/golden/cli.txt");
+    let sources = files("", "rs").into_iter().filter(|path| !path.ends_with("architecture/pages.rs"));
+    sources.for_each(|path| known += &read(path).replace("\\\"", "\""));
+    let known = spaced(&known);
+    let parts = printed(&read("README.md"));
+    assert!(parts.len() > 15, "{parts:?}");
+    for part in parts {
+        let alike = NAMES.iter().fold(part.clone(), |text, (here, there)| text.replace(here, there));
+        assert!(known.contains(&part) || known.contains(&alike), "no test prints: {part}");
+    }
+    assert_eq!(printed("a\n```console\n$ b\nnext: c  d … e\n```\nf"), ["c d", "e"]);
+}
