@@ -49,12 +49,14 @@ fn typed(arg: &Arg) -> String {
         names.iter().map(|name| format!("<{name}>")).collect::<Vec<_>>().join(" ") + more
     };
     let takes = arg.get_num_args().is_some_and(|n| n.takes_values());
+    let is_optional = arg.get_num_args().is_some_and(|n| n.min_values() == 0);
     let mut words = Vec::new();
     words.extend(arg.get_short().map(|short| format!("-{short}")));
     words.extend(arg.get_long().map(|long| format!("--{long}")));
     let flag = words.join(", ");
     match (flag.is_empty(), takes) {
         (true, _) => value(),
+        (false, true) if is_optional => format!("{flag}[={}]", value()),
         (false, true) => format!("{flag} {}", value()),
         (false, false) => flag,
     }
@@ -97,7 +99,7 @@ fn described(arg: &Arg) -> String {
 }
 
 fn item(arg: &Arg) -> String {
-    wrapped(&format!("- `{}`: {}", typed(arg), described(arg)), "  ")
+    wrapped(format!("- `{}`: {}", typed(arg), described(arg)).trim_end_matches([':', ' ']), "  ")
 }
 
 /// Lines of at most [`LINE_MAX`] characters, all but the first behind `indent`; a word that is longer stands alone.
