@@ -107,6 +107,35 @@ fn every_link_of_a_page_leads_to_a_file_or_folder() {
     assert_eq!(links("[a](docs/a.md#b) [b](#c) [c](https://x.y) `f[0](1 2)`"), ["docs/a.md"]);
 }
 
+/// Methods that a page names as grpcurl takes them: package, service, method.
+fn methods(page: &str) -> Vec<[&str; 3]> {
+    let words = page.split(|c: char| c.is_whitespace() || "`()[],;'\"".contains(c));
+    let named = words.filter_map(|word| word.strip_prefix("midshift.")?.split_once('/'));
+    named
+        .filter_map(|(service, method)| service.rsplit_once('.').map(|(package, name)| [package, name, method]))
+        .collect()
+}
+
+#[test]
+fn every_method_that_a_page_calls_is_one_of_the_proto_files() {
+    let protos: Vec<String> = files("proto", "proto").iter().map(read).collect();
+    let mut seen = 0;
+    for path in pages() {
+        for [package, service, method] in methods(&read(&path)) {
+            seen += 1;
+            let parts =
+                [format!("package midshift.{package};"), format!("service {service} {{"), format!("rpc {method}(")];
+            let is_there = protos.iter().any(|proto| parts.iter().all(|part| proto.contains(part)));
+            assert!(is_there, "{path}: {package}.{service}/{method}");
+        }
+    }
+    assert!(seen >= 5, "only {seen} methods found");
+    assert_eq!(
+        methods("`midshift.task.v1.TaskService/SubmitTask` /midshift.a/b"),
+        [["task.v1", "TaskService", "SubmitTask"]]
+    );
+}
+
 /// Words of a line with one space between them.
 fn spaced(line: &str) -> String {
     line.split_whitespace().collect::<Vec<_>>().join(" ")
