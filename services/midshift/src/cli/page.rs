@@ -62,7 +62,7 @@ fn typed(arg: &Arg) -> String {
     }
 }
 
-/// Text of a doc comment in Markdown: what would be markup outside of code is not.
+/// Text of a doc comment in Markdown: what would be markup outside of code is not, and the full stop that clap takes away is there again.
 fn plain(text: &str) -> String {
     let mut is_code = false;
     let mut plain = String::new();
@@ -72,6 +72,9 @@ fn plain(text: &str) -> String {
             plain.push('\\');
         }
         plain.push(c);
+    }
+    if plain.ends_with(|c: char| c.is_alphanumeric() || ")`\"".contains(c)) {
+        plain.push('.');
     }
     plain
 }
@@ -134,7 +137,7 @@ fn verbs(command: &Command) -> Vec<&Command> {
 
 /// Counts, over all commands below, the options that are typed and described alike.
 fn count(command: &Command, counted: &mut BTreeMap<String, usize>) {
-    for arg in arguments(command) {
+    for arg in arguments(command).into_iter().filter(|arg| !arg.is_positional()) {
         *counted.entry(item(arg)).or_default() += 1;
     }
     verbs(command).into_iter().for_each(|verb| count(verb, counted));
@@ -156,7 +159,8 @@ fn tell(command: &Command, path: &str, depth: usize, shared: &BTreeMap<String, u
     let alike: Vec<String> = alike
         .into_iter()
         .filter(|arg| !arg.is_global_set())
-        .map(|arg| format!("`{}`", arg.get_long().map_or_else(|| typed(arg), |long| format!("--{long}"))))
+        .filter_map(|arg| arg.get_long())
+        .map(|long| format!("`--{long}`"))
         .collect();
     if !alike.is_empty() {
         *page += "\n";
