@@ -176,7 +176,7 @@ enum Remedy {
 }
 
 impl Exit {
-    /// With a code of the list in the README.
+    /// With a code of the list in docs/cli.md.
     pub fn new(code: u8, text: impl Into<String>) -> Self {
         let remedy = if code == NO_SERVER { Remedy::Later } else { Remedy::None };
         Self { code, text: text.into(), remedy }

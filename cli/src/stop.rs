@@ -615,6 +615,12 @@ mod tests {
     }
 
     #[test]
+    fn a_stop_that_all_have_confirmed_ends_with_how_many_stand() {
+        let counts = v1::Counts { standstill_confirmed: 12, ..v1::Counts::default() };
+        assert_eq!(summary(&counts), "12 stand, 0 acknowledged, 0 are elsewhere, 0 requested, 0 unreachable");
+    }
+
+    #[test]
     fn only_what_robots_said_counts_as_confirmed() {
         let robot = |confirmation: v1::Confirmation| v1::RobotStop {
             robot_id: "r1".to_owned(),

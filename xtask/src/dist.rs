@@ -15,11 +15,13 @@ use std::process::Command;
 /// Programs of an archive.
 const PROGRAMS: [&str; 2] = ["midshift", "midshift-launcher"];
 /// What goes with them, files and folders of the repository.
-const BESIDE: [&str; 11] = [
+const BESIDE: [&str; 13] = [
     "ARCHITECTURE.md",
     "CHANGELOG.md",
+    "CONTRIBUTING.md",
     "LICENSE",
     "README.md",
+    "SECURITY.md",
     "STYLE.md",
     "clients",
     "deploy",

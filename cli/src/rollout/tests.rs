@@ -311,6 +311,30 @@ fn aborted(phase: RolloutPhase) -> v1::Rollout {
 }
 
 #[test]
+fn who_watches_a_bad_release_hears_which_robot_is_behind_its_end() {
+    let rollout_id = "walk-1.6.0-bad-at-start".to_owned();
+    let aborted = aborted(RolloutPhase::Aborted);
+    let abort = v1::RolloutAbort {
+        reason: Some(shown(&Reason::from(Code::FailureAmongFew))),
+        hard: false,
+        robot_ids: vec!["rbt-07".into()],
+        touched: 1,
+        ..aborted.abort.clone().unwrap()
+    };
+    let behind = "aborted: FAILURE_AMONG_FEW: A robot failed while fewer than ten were attempted., behind it rbt-07, 1 robot had permission by then";
+    assert_eq!(text::abort(&abort), behind);
+    let rollout = v1::Rollout { rollout_id, abort: Some(abort), ..aborted };
+    let news = Picture::default().take(v1::WatchRolloutResponse { rollout: Some(rollout.clone()), robots: Vec::new() });
+    let moved = "walk-1.6.0-bad-at-start  ABORTED  wave 2/3";
+    assert!(news.iter().any(|line| line.contains(moved)), "{news:?}");
+    let told = end(&rollout, Until::Ended).and_then(Result::err).unwrap().to_string();
+    let expected = "\
+walk-1.6.0-bad-at-start is ABORTED: FAILURE_AMONG_FEW: A robot failed while fewer than ten were attempted.
+  try: midshift rollout get walk-1.6.0-bad-at-start";
+    assert_eq!(told, expected);
+}
+
+#[test]
 fn a_wait_ends_with_the_code_of_its_end() {
     let code = |rollout: &v1::Rollout, until| end(rollout, until).map(|e| e.map_or_else(|exit| exit.code(), |()| 0));
     let of = |phase: RolloutPhase| v1::Rollout { phase: phase as i32, ..rollout() };

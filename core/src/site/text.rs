@@ -2,25 +2,7 @@
 //!
 //! Invariant: `parse(render(site)) == site`; an unknown key is a mistake. Called by the binary and by tests.
 //!
-//! ```toml
-//! site_id = "shop"
-//! name = "A small shop"
-//! map_id = "shop"
-//! map_version = "1"
-//! area = [ { id = "floor", speed_limit_mm_s = 1500 } ]    # a waypoint without an area lies in the first one
-//! # beside it: people, avoidance_distance_mm, charge_*_permille, and acts_on_rates = true: rates of task failures end roll-outs there
-//! waypoint = [
-//!   { id = "j1", at = [0, 0] },                           # millimetres east and north
-//!   { id = "j2", at = [4000, 0] },
-//!   { id = "A01", at = [2000, 1000], kind = "station" },  # kind: junction, station, charger, park, hold
-//! ]
-//! lane = [
-//!   { path = ["j1", "A01", "j2"] },                       # one-way, straight from each to the next
-//!   { path = ["j1", "j2"], ways = "two" },                # ways: one, two (single width), wide (side by side)
-//! ]
-//! passage = [ { id = "door", rule = "exclusive", lanes = [["j1", "j2"], ["j2", "j1"]] } ]
-//! robot = [ { id = "rbt-01", at = "A01" } ]               # where it starts: kept free for it until it is heard; may be left out
-//! ```
+//! What may stand in a file is told in docs/sites.md, whose example is read here.
 
 use super::draft::{Draft, DraftArea, DraftLane, DraftPassage, DraftRobot, DraftWaypoint};
 use super::{Area, AreaDefaults, Kind, Lane, Place, PlaceKind, Site, Source, Waypoint};
@@ -371,6 +353,14 @@ mod tests {
             let again = parse(&render(&site)).expect("its own text reads");
             assert_eq!(again, site);
         }
+    }
+
+    #[test]
+    fn the_example_of_the_page_about_sites_is_one() {
+        let page = include_str!("../../../docs/sites.md");
+        let example = page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("an example");
+        let site = parse(example).expect("reads");
+        assert_eq!((site.site_id().as_str(), site.stations().count()), ("shop", 1));
     }
 
     #[test]

@@ -217,7 +217,8 @@ pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Re
     // The server ends after its robots and its client, or the last of them would be cut off at Ctrl-C.
     let served_until = CancellationToken::new();
     let server = Server::new(parts, served_until.clone()).await?.hearing(beacons).with_probation(PROBATION_MS);
-    say(&greeting(&args, &site, address, stops.beside.address(), &software));
+    let made = (software.keys(), software.repository());
+    say(&greeting(&args, &site, address, stops.beside.address(), made));
     let stage = match scene {
         Some(scene) => {
             let sight = Sight { store: store.clone(), board: server.board(), site: site.clone(), clock: clock.clone() };
@@ -370,10 +371,9 @@ async fn stores(
     Ok((Arc::new(MemoryStore::new(site_id, id, clock.clone())), Arc::new(frames)))
 }
 
-fn greeting(args: &Dev, site: &Site, address: SocketAddr, stops: SocketAddr, software: &Throwaway) -> String {
+fn greeting(args: &Dev, site: &Site, address: SocketAddr, stops: SocketAddr, made: (PathBuf, PathBuf)) -> String {
     let program = std::env::args().next().unwrap_or_else(|| "midshift".to_owned());
-    let (keys, repository) = (software.keys(), software.repository());
-    let (keys, repository) = (keys.display(), repository.display());
+    let (keys, repository) = (made.0.display(), made.1.display());
     let kept = args
         .data
         .as_ref()
@@ -620,4 +620,40 @@ fn bar(seconds: u64) -> ProgressBar {
         bar.set_style(style);
     }
     bar
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        dev: Dev,
+    }
+
+    #[test]
+    fn the_greeting_says_what_runs_where_and_how_to_put_a_bad_release_into_it() -> anyhow::Result<()> {
+        let args = Line::parse_from(["dev"]).dev;
+        let site = site_file::load(None, None, None)?.site;
+        let made = (PathBuf::from("KEYS"), PathBuf::from("REPOSITORY"));
+        let text = greeting(&args, &site, "127.0.0.1:7420".parse()?, "127.0.0.1:7421".parse()?, made);
+        let lines: Vec<&str> = text.lines().collect();
+        assert_eq!(
+            lines[..3],
+            [
+                "midshift dev  12 simulated robots, site \"demo\", data in memory (--data DIR keeps it)",
+                "gRPC http://127.0.0.1:7420 (reflection on)   metrics http://127.0.0.1:7420/metrics   no login, no TLS: NOT for production",
+                "Stop http://127.0.0.1:7421: an operational stop request, not a safety function",
+            ]
+        );
+        for command in [
+            "bundle samples SAMPLES --config-only --repository REPOSITORY --key KEYS/targets-1.pem",
+            "bundle push REPOSITORY",
+        ] {
+            assert!(lines.iter().any(|line| line.ends_with(command)), "{text}");
+        }
+        Ok(())
+    }
 }

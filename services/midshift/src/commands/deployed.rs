@@ -11,8 +11,13 @@ const UNITS: [(&str, &str); 3] = [
     ("midshift-robot.service", include_str!("../../../../deploy/midshift-robot.service")),
 ];
 
-const PAGES: [(&str, &str); 6] = [
+const PAGES: [(&str, &str); 11] = [
+    ("README.md", include_str!("../../../../README.md")),
     ("docs/audit.md", include_str!("../../../../docs/audit.md")),
+    ("docs/numbers.md", include_str!("../../../../docs/numbers.md")),
+    ("docs/run-a-floor.md", include_str!("../../../../docs/run-a-floor.md")),
+    ("docs/send-orders.md", include_str!("../../../../docs/send-orders.md")),
+    ("docs/sites.md", include_str!("../../../../docs/sites.md")),
     ("docs/runbooks/backup.md", include_str!("../../../../docs/runbooks/backup.md")),
     ("docs/runbooks/keys.md", include_str!("../../../../docs/runbooks/keys.md")),
     ("docs/runbooks/split.md", include_str!("../../../../docs/runbooks/split.md")),
@@ -20,21 +25,51 @@ const PAGES: [(&str, &str); 6] = [
     ("ota_bundles/README.md", include_str!("../../../../ota_bundles/README.md")),
 ];
 
-/// Words of each line in a block of code that starts this program, up to a comment or to what the shell does with it.
+/// Words of a line as a shell reads them, up to a comment or to what the shell does with what was printed.
+fn words(line: &str) -> Vec<String> {
+    let (mut words, mut quote) = (Vec::new(), None);
+    let mut word: Option<String> = None;
+    for c in line.chars().chain([' ']) {
+        match quote {
+            Some(q) if q == c => quote = None,
+            Some(_) => word.get_or_insert_default().push(c),
+            None if c == '\'' || c == '"' => {
+                quote = Some(c);
+                word.get_or_insert_default();
+            }
+            None if c == '#' && word.is_none() => break,
+            None if c.is_whitespace() => match word.take() {
+                Some(end) if ["|", "&&", ">", "2>"].contains(&end.as_str()) => break,
+                Some(end) => words.push(end),
+                None => {}
+            },
+            None => word.get_or_insert_default().push(c),
+        }
+    }
+    words
+}
+
+/// Words of each line in a block of code that starts this program. In a block of what a console shows these are the lines behind `$`.
 fn typed(page: &str) -> Vec<Vec<String>> {
-    let ends = |word: &&str| ["#", "|", "&&", ">"].contains(word);
-    let mut is_fenced = false;
+    let mut block: Option<&str> = None;
     let mut typed = Vec::new();
     for line in page.lines() {
-        is_fenced ^= line.starts_with("```");
-        if !is_fenced && !line.starts_with("    ") {
+        if let Some(kind) = line.strip_prefix("```") {
+            block = if block.is_some() { None } else { Some(kind) };
+            continue;
+        }
+        if block.is_none() && !line.starts_with("    ") {
             continue;
         }
         let line = line.trim_start();
-        // A digest that a page cuts short.
-        let line = line.strip_prefix("sudo ").unwrap_or(line).replace("9f3c…", &"9f3c".repeat(16));
+        let line = match block {
+            Some("console") => line.strip_prefix("$ ").unwrap_or_default(),
+            _ => line.strip_prefix("sudo ").unwrap_or(line),
+        };
+        // A digest that a page cuts short, and a program that is built first.
+        let line = line.replace("9f3c…", &"9f3c".repeat(16)).replace("cargo run --release -- ", "midshift ");
         if line.starts_with("midshift ") {
-            typed.push(line.split_whitespace().take_while(|word| !ends(word)).map(str::to_owned).collect());
+            typed.push(words(&line));
         }
     }
     typed
@@ -82,6 +117,19 @@ fn every_command_on_a_page_for_operators_is_one_that_there_is_with_arguments_tha
             read(&words);
         }
     }
+}
+
+#[test]
+fn a_command_is_read_as_a_shell_reads_it() {
+    assert_eq!(
+        words("midshift stop --all --reason 'it\"s down' && rm x"),
+        ["midshift", "stop", "--all", "--reason", "it\"s down"]
+    );
+    assert_eq!(words("midshift task ls   # nobody's"), ["midshift", "task", "ls"]);
+    assert_eq!(words("midshift task ls --cursor \"\" > file"), ["midshift", "task", "ls", "--cursor", ""]);
+    let page =
+        "```console\n$ cargo run --release -- dev\nmidshift dev  12\n```\nmidshift not\n```\nsudo midshift health\n```";
+    assert_eq!(typed(page), [vec!["midshift", "dev"], vec!["midshift", "health"]]);
 }
 
 #[test]

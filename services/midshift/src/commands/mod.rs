@@ -232,6 +232,8 @@ async fn migrate(data: &std::path::Path, database: &Database, out: &Out) -> Resu
 #[cfg(test)]
 mod deployed;
 #[cfg(test)]
+mod page;
+#[cfg(test)]
 mod tests {
     use super::*;
     use clap::CommandFactory;
