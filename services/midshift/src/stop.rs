@@ -11,11 +11,11 @@ mod program;
 mod started;
 
 pub use first_start::{Occasion, announce};
+pub use midshift_agent::program::{STOP_PORT as PORT, stop_service_beside as beside_on};
 pub use program::FOLDER;
 pub use started::{LOG, Started};
 
 use crate::door::{self, Login, Share};
-use crate::way::uri;
 use crate::{clock, recorder, site_file};
 use anyhow::{Context, bail, ensure};
 use axum::routing::get;
@@ -36,8 +36,6 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
 
-/// Its port, beside the 7420 of the business.
-pub const PORT: u16 = 7421;
 /// As metrics and logs name it.
 const PORT_NAME: &str = "stop";
 /// How often one that follows looks whether the folder is free: nobody is answered meanwhile.
@@ -50,12 +48,6 @@ const PRINCIPALS_EVERY: Duration = Duration::from_millis(500);
 /// The stop service on the host of a server: host:port. None: `server` names no host.
 pub fn beside(server: &str) -> Option<String> {
     beside_on(server, PORT)
-}
-
-/// The same where it has another port.
-pub fn beside_on(server: &str, port: u16) -> Option<String> {
-    let uri: http::Uri = uri(server).parse().ok()?;
-    Some(format!("{}:{port}", uri.host()?))
 }
 
 /// What `stop serve` was asked for.

@@ -176,10 +176,10 @@ mod tests {
         assert!(argument.is_err(), "other users of a machine see what stands on a command line");
         let taken = command.try_get_matches_from(["run"].into_iter().chain(words.split(' ')));
         let taken = AgentRun::from_arg_matches(&taken.expect("words that are known")).expect("its arguments");
-        assert_eq!((taken.robot_id.as_str(), taken.server.as_str()), ("r7", "hub:7401"));
-        assert_eq!(taken.identity.identity_server.as_deref(), Some("hub:7402"));
+        assert_eq!((taken.config.robot_id.as_str(), taken.config.server.as_str()), ("r7", "hub:7401"));
+        assert_eq!(taken.config.identity.identity_server.as_deref(), Some("hub:7402"));
         assert_eq!(taken.site, Some("/etc/hall.toml".into()));
-        assert_eq!(taken.stop.stop_server.as_deref(), Some("hub:18421"));
+        assert_eq!(taken.config.stop.stop_server.as_deref(), Some("hub:18421"));
     }
 
     #[test]
