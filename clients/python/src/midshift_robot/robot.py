@@ -9,6 +9,7 @@ import math
 import pathlib
 import queue
 import random
+import signal
 import sys
 import time
 import uuid
@@ -762,8 +763,9 @@ def flags(description: str | None = None) -> argparse.ArgumentParser:
 
 
 def run(body: Body, args: argparse.Namespace | None = None) -> None:
-    """Drives `body` until the program ends; by `args` of `flags`, or by the command line."""
+    """Drives `body` until the program is told to end; by `args` of `flags`, or by the command line."""
     robot = Robot(body, args or flags().parse_args())
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         while True:
             robot.tick()
