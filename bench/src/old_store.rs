@@ -11,7 +11,7 @@ use crate::offer::{Idle, one};
 use crate::submit::transports;
 use anyhow::{Context, ensure};
 use midshift::storage::Database;
-use midshift_cli::clock::wall;
+use midshift_agent::clock::wall;
 use midshift_core::site::{Site, grid};
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::fleet::v1::{CordonRobotRequest, ExplainRobotRequest, ExplainTaskRequest, UncordonRobotRequest};

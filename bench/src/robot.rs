@@ -35,7 +35,7 @@ pub fn hello(name: &str, waypoint: Option<WaypointId>) -> anyhow::Result<Hello> 
     Ok(Hello {
         inventory: Inventory { capabilities, payload_g: 10_000, ..Inventory::default() },
         reported: ReportedState { vitals, ..ReportedState::default() },
-        sent_unix_ms: midshift_cli::clock::wall().0,
+        sent_unix_ms: midshift_agent::clock::wall().0,
         ..Hello::new(RobotId::parse(name)?, format!("{name}-boot"), format!("{name}-ring"))
     })
 }
@@ -69,7 +69,7 @@ impl Voice {
         let body = with_status.then(|| SampleBody::Status(self.reported.vitals.clone()));
         let batches = body.map(|body| self.batch(Lane::Status, vec![body])).into_iter().collect();
         self.reported.hb += 1;
-        let sent_unix_us = midshift_cli::clock::wall().0 * 1000;
+        let sent_unix_us = midshift_agent::clock::wall().0 * 1000;
         let heartbeat = Some(Heartbeat { reported: self.reported.clone(), sent_unix_us, clock: None });
         self.say(Uplink { heartbeat, batches }).await
     }
@@ -85,7 +85,7 @@ impl Voice {
     /// What one STATUS message takes of the credit, bytes.
     pub fn status_bytes(&self) -> usize {
         let body = SampleBody::Status(self.reported.vitals.clone());
-        let sample = Sample { seq: u64::from(u32::MAX), robot_unix_ms: midshift_cli::clock::wall().0, body };
+        let sample = Sample { seq: u64::from(u32::MAX), robot_unix_ms: midshift_agent::clock::wall().0, body };
         v1::LaneBatch::from(&LaneBatch { lane: Lane::Status, items: vec![InboxItem::Sample(sample)] }).encoded_len()
     }
     /// Highest number written in a lane.
@@ -93,7 +93,7 @@ impl Voice {
         self.reported.produced.get(&lane).copied().unwrap_or(0)
     }
     fn batch(&mut self, lane: Lane, bodies: Vec<SampleBody>) -> LaneBatch {
-        let robot_unix_ms = midshift_cli::clock::wall().0;
+        let robot_unix_ms = midshift_agent::clock::wall().0;
         let last = self.reported.produced.entry(lane).or_default();
         let number = |body| {
             *last += 1;

@@ -77,7 +77,7 @@ fn moment(text: &str) -> Result<Utc, String> {
         return Ok(at);
     }
     let ago = duration(text).map_err(|_| "must be as 2026-11-22T06:00:00Z, or how long ago, as 8h".to_owned())?;
-    Ok(Utc(crate::clock::wall().0 - ago.as_millis() as i64))
+    Ok(Utc(midshift_agent::clock::wall().0 - ago.as_millis() as i64))
 }
 
 fn mark(text: &str) -> Result<Mark, String> {
@@ -227,7 +227,7 @@ fn read(path: &Path, noted: &[Mark]) -> Result<v1::VerifyAuditResponse, Exit> {
     for line in first {
         marks.extend(Mark::in_line(&line?));
     }
-    let (mut held, mut rows_read) = (Held::new(&export, &marks, crate::clock::wall()), 0);
+    let (mut held, mut rows_read) = (Held::new(&export, &marks, midshift_agent::clock::wall()), 0);
     for line in lines()?.skip(1) {
         held.take(&line?);
         rows_read += 1;

@@ -5,7 +5,7 @@ mod root;
 use super::client::{Call, Change, Exit};
 use super::out::{Format, Out};
 use super::{push, released};
-use crate::clock;
+use midshift_agent::clock;
 use crate::samples::{self, Signer};
 use clap::{Subcommand, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};

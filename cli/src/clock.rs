@@ -1,21 +1,12 @@
-//! Reads the wall clock of this machine, and leaves a person's word that it is right.
+//! Leaves a person's word that the wall clock of this machine is right.
 
 use anyhow::Context;
-use midshift_core::time::Utc;
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 /// The file of the data folder that is the word.
 pub const ACCEPTED: &str = "clock-accepted";
-
-/// UTC of the machine, unix ms.
-#[expect(clippy::disallowed_methods, reason = "the one place where the machine's wall clock is read")]
-pub fn wall() -> Utc {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    Utc(i64::try_from(since.as_millis()).unwrap_or(i64::MAX))
-}
 
 /// Leaves the word for the server of `data`.
 ///

@@ -4,12 +4,10 @@ use super::client::{Call, Exit, unary};
 use super::lookup::{self, Found, whole_id};
 use super::out::Out;
 use crate::stop_service;
+use midshift_agent::program::ENROLL;
 use midshift_core::site::{self, text};
 use midshift_proto::convert::time_of;
 use midshift_proto::identity::v1;
-
-/// Variable with the secret that enrols a robot.
-pub const ENROLL: &str = "MIDSHIFT_ENROLL";
 
 /// Which machine is to be which robot.
 #[derive(clap::Args)]

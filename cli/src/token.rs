@@ -2,7 +2,7 @@
 
 use super::client::{Call, Exit, unary};
 use super::out::Out;
-use crate::clock;
+use midshift_agent::clock;
 use crate::duration;
 use clap::Subcommand;
 use midshift_core::identity::Grant;

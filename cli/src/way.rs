@@ -13,6 +13,8 @@ use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Request, Status};
 
+pub use midshift_agent::dial::with_scheme;
+
 /// A server that does not answer a connection within this is not there.
 const CONNECT_WITHIN: Duration = Duration::from_secs(3);
 /// A connection with a call under way on which nothing came for so long is asked for a sign of life, and is gone if none comes within [`ALIVE_WITHIN`].
@@ -22,11 +24,6 @@ const ALIVE_WITHIN: Duration = Duration::from_secs(20);
 /// The address with its scheme, for plain text.
 pub fn uri(server: &str) -> String {
     with_scheme("http", server)
-}
-
-/// The address with this scheme, if it has none.
-pub fn with_scheme(scheme: &str, server: &str) -> String {
-    if server.contains("://") { server.to_owned() } else { format!("{scheme}://{server}") }
 }
 
 /// A channel that shows the token, if there is one.

@@ -1,13 +1,13 @@
 //! What a machine must offer so that the agent can drive it: the whole of `trait Body`, for makers to implement.
 //!
-//! A vendor SDK, a ROS 2 node or a simulator stands behind it; `examples/` of this crate has one that reads in two minutes.
+//! A vendor SDK, a ROS 2 node or a simulator stands behind it; `examples/own_robot.rs` is one in 60 lines, docs/make-a-robot.md leads there.
 //! Every call returns at once. The agent polls; a body never calls back, never blocks and never reads a clock of its own:
 //! `now` is the site clock. Invariant: the agent never asks for more than `limits` allow, and a body may always do less.
 
-use midshift_core::ids::WaypointId;
-use midshift_core::robot::{Fault, HardwareStop, Inventory, Load, Mode, Pose, StopLevel};
-use midshift_core::time::SiteTime;
-use midshift_core::work::StepKind;
+pub use midshift_core::ids::{TaskId, WaypointId};
+pub use midshift_core::robot::{Fault, HardwareStop, Inventory, Load, Mode, Pose, StopLevel};
+pub use midshift_core::time::{SiteDuration, SiteTime};
+pub use midshift_core::work::StepKind;
 
 /// What the maker allows, whatever anybody asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -34,6 +34,19 @@ pub struct PathPoint {
     /// Distance to keep from people and things on the way to this point, millimetres. None: the body's own. A body that cannot
     /// measure distances drives as it does.
     pub keep_off_mm: Option<u32>,
+}
+
+impl PathPoint {
+    /// Moves `pose` straight to this point for so long, no faster than asked; true: it is there. For bodies that are only pretended.
+    pub fn approach(&self, pose: &mut Pose, duration: SiteDuration) -> bool {
+        let (dx, dy) = (f64::from(self.x_mm - pose.x_mm), f64::from(self.y_mm - pose.y_mm));
+        let (left_mm, may_mm) = (dx.hypot(dy), f64::from(self.speed_mm_s) * duration.as_ms() as f64 / 1_000.0);
+        let is_there = left_mm <= may_mm;
+        let share = if is_there { 1.0 } else { may_mm / left_mm };
+        pose.x_mm += (share * dx).round() as i32;
+        pose.y_mm += (share * dy).round() as i32;
+        is_there
+    }
 }
 
 /// One order to the body.
@@ -77,7 +90,7 @@ pub enum Checked {
 }
 
 /// Readings that change all the time.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct BodyState {
     /// Where it is.
     pub pose: Pose,
@@ -109,7 +122,7 @@ pub trait Body: Send {
     fn limits(&self) -> BodyLimits;
     /// Whose work the orders after this call are: the task and the index of its step; none for an errand or none. Said before
     /// [`Body::start`], so that the body's own records and its [`Load`] can name the task. A body that keeps no records ignores it.
-    fn work_for(&mut self, _task_id: Option<&midshift_core::ids::TaskId>, _step_index: u32) {}
+    fn work_for(&mut self, _task_id: Option<&TaskId>, _step_index: u32) {}
     /// Begins an order. An error is a fault that was clear at once (unknown action); the body stands.
     fn start(&mut self, now: SiteTime, order: BodyOrder) -> Result<(), Fault>;
     /// Stands still and keeps its order.
@@ -121,12 +134,14 @@ pub trait Body: Send {
     /// The level of operational stop that the robot obeys from now on; told whenever it changes. What follows of it for its orders the agent says by
     /// [`Body::pause`], [`Body::stop`] and the speeds of its path; a body that has more to slow down or to show does that here.
     fn obeys(&mut self, _now: SiteTime, _level: StopLevel) {}
-    /// It stands and will not move by itself.
-    fn standstill(&self, now: SiteTime) -> bool;
-    /// Takes the posture in which it may stand for long.
-    fn park(&mut self, now: SiteTime);
-    /// Starts or stops charging; only called while it stands at a charger.
-    fn charge(&mut self, now: SiteTime, on: bool);
+    /// It stands and will not move by itself. By default: nothing will change.
+    fn standstill(&self, now: SiteTime) -> bool {
+        self.next_change(now).is_none()
+    }
+    /// Takes the posture in which it may stand for long. A body that may always stand as it stands does nothing.
+    fn park(&mut self, _now: SiteTime) {}
+    /// Starts or stops charging; only called while it stands at a charger. A body that charges by itself there does nothing.
+    fn charge(&mut self, _now: SiteTime, _on: bool) {}
     /// What happened since the last call, in order. Called after every other call and at `next_change`.
     fn poll(&mut self, now: SiteTime) -> Vec<BodyNews>;
     /// When the next news will come if nobody asks for anything else; none: not before it is asked for something.
@@ -138,19 +153,45 @@ pub trait Body: Send {
     /// A person has looked: it carries nothing. Asked only of a body whose [`Inventory`] says that it knows its load by memory alone. From
     /// then on [`Body::load`] is none, and its next news says so. A body that feels what it carries ignores it.
     fn forget_load(&mut self, _now: SiteTime) {}
-    /// Whether a step that may have been under way at a restart was done. `task_id` names whose step it was.
-    fn check(&self, step: &StepKind, task_id: Option<&midshift_core::ids::TaskId>) -> Checked;
+    /// Whether a step that may have been under way at a restart was done. `task_id` names whose step it was. A body that cannot tell leaves it to people.
+    fn check(&self, _step: &StepKind, _task_id: Option<&TaskId>) -> Checked {
+        Checked::Unknown
+    }
     /// The maker's own test, asked for once when the agent starts and the body stands; an error says what is broken. Until the body says
-    /// that this fault is over ([`BodyNews::Fault`]) the robot accepts no work.
-    fn self_test(&mut self, now: SiteTime) -> Result<(), Fault>;
-    /// State of the maker's own safety system.
-    fn hardware_stop(&self) -> HardwareStop;
-    /// Who drives.
-    fn mode(&self) -> Mode;
+    /// that this fault is over ([`BodyNews::Fault`]) the robot accepts no work. A body without a test has nothing to say.
+    fn self_test(&mut self, _now: SiteTime) -> Result<(), Fault> {
+        Ok(())
+    }
+    /// State of the maker's own safety system. A body that cannot see it says that nothing is engaged.
+    fn hardware_stop(&self) -> HardwareStop {
+        HardwareStop::None
+    }
+    /// Who drives. A body without a manual mode is always automatic.
+    fn mode(&self) -> Mode {
+        Mode::Automatic
+    }
     /// Version of the site's map that it drives by; empty: it goes by the points of its orders alone.
     fn map_version(&self) -> String {
         String::new()
     }
-    /// Waypoints it stands on or reaches into now, as far as it knows, e.g. after a restart.
+    /// Waypoints it stands on or reaches into now, as far as it knows, e.g. after a restart. None between two.
     fn stands_on(&self) -> Vec<WaypointId>;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pretended_body_comes_to_its_point_in_the_time_that_the_way_takes() {
+        let waypoint = WaypointId::parse("a").expect("a name");
+        let point = PathPoint { waypoint, x_mm: 300, y_mm: -400, speed_mm_s: 1_000, keep_off_mm: None };
+        let mut pose = Pose::default();
+        assert!(!point.approach(&mut pose, SiteDuration(250)));
+        assert_eq!((pose.x_mm, pose.y_mm), (150, -200));
+        assert!(!point.approach(&mut pose, SiteDuration(0)), "no time, no way");
+        assert!(point.approach(&mut pose, SiteDuration(1_000)));
+        assert_eq!((pose.x_mm, pose.y_mm), (300, -400));
+        assert!(point.approach(&mut pose, SiteDuration(0)), "it is there already");
+    }
 }

@@ -47,6 +47,11 @@ impl Error {
     }
 }
 
+/// The address with this scheme, if it has none.
+pub fn with_scheme(scheme: &str, server: &str) -> String {
+    if server.contains("://") { server.to_owned() } else { format!("{scheme}://{server}") }
+}
+
 /// Makes connections to the server. Implemented here over TCP, and by simulations over their own network.
 #[async_trait]
 pub trait Dial: Send + Sync {

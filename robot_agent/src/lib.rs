@@ -1,11 +1,13 @@
 //! What a robot runs: the session to the server, the ring of samples, the ledger of work, the governor, and the body it drives.
 //!
+//! A maker implements [`body::Body`] and calls [`run`]; `examples/own_robot.rs` does.
 //! Invariant: a buffered message never starts the body, and a finished task is never done again.
 
 pub mod body;
 pub mod boot;
 pub mod bugs;
 pub mod bulk;
+pub mod clock;
 pub mod core;
 pub mod device;
 pub mod dial;
@@ -21,6 +23,7 @@ mod load;
 pub mod memory;
 mod offer;
 pub mod places;
+pub mod program;
 pub mod pulse;
 mod repeats;
 pub mod replay;
@@ -37,3 +40,5 @@ pub mod tls;
 pub mod trust;
 pub mod update;
 pub mod work;
+
+pub use program::{Config, run};

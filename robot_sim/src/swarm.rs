@@ -36,8 +36,8 @@ use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
-/// Name of an agent's ledger and ring in its directory.
-pub const AGENT_FILE: &str = "agent.db";
+pub use midshift_agent::program::AGENT_FILE;
+
 /// Name of the folder of its sets of software there.
 const SETS: &str = "sets";
 /// The person goes round this often, milliseconds of site time.

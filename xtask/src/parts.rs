@@ -125,9 +125,9 @@ impl Part {
     }
 }
 
-/// Builds the programs. Tests too: a build without them has other features, and everything would be compiled twice.
+/// Builds the programs, the example of a robot's too. Tests as well: a build without them has other features, and everything would be compiled twice.
 pub fn build(workspace: &Workspace) -> Result<bool> {
-    run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins", "--tests"]))
+    run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins", "--examples", "--tests"]))
 }
 
 /// `cargo test` of these targets, which hear where the programs are.

@@ -258,12 +258,12 @@ impl<'a> Stage<'a> {
     /// Nothing but robots that report.
     async fn leg(&mut self, long: Duration) -> anyhow::Result<Leg> {
         self.settle().await?;
-        let (begun, from_ms, bytes) = (Instant::now(), midshift_cli::clock::wall().0, self.line.bytes_down()?);
+        let (begun, from_ms, bytes) = (Instant::now(), midshift_agent::clock::wall().0, self.line.bytes_down()?);
         sleep(long / 2).await;
         let jam = self.jam().await?;
         sleep(long.saturating_sub(begun.elapsed())).await;
         let mbit_s = self.rate(bytes, begun)?;
-        Ok(Leg { stretch: from_ms..=midshift_cli::clock::wall().0, jam, mbit_s, taken: self.taken()? })
+        Ok(Leg { stretch: from_ms..=midshift_agent::clock::wall().0, jam, mbit_s, taken: self.taken()? })
     }
 
     fn rate(&self, bytes: u64, begun: Instant) -> anyhow::Result<f64> {
@@ -279,14 +279,14 @@ impl<'a> Stage<'a> {
         }
         take(&mut self.asker)?;
         take(&mut self.bare)?;
-        let (begun, from_ms, bytes) = (Instant::now(), midshift_cli::clock::wall().0, self.line.bytes_down()?);
+        let (begun, from_ms, bytes) = (Instant::now(), midshift_agent::clock::wall().0, self.line.bytes_down()?);
         sleep(args.leg() / 2).await;
         let jam = self.jam().await?;
         let (mut to_ms, mut mbit_s, mut filled) = (0, 0.0, Instant::now());
         while filled.elapsed() < QUIET {
             ensure!(Instant::now() < end, "the download did not end");
             if self.look(args).await? >= 0.5 {
-                (to_ms, mbit_s, filled) = (midshift_cli::clock::wall().0, self.rate(bytes, begun)?, Instant::now());
+                (to_ms, mbit_s, filled) = (midshift_agent::clock::wall().0, self.rate(bytes, begun)?, Instant::now());
             }
         }
         let taken = self.taken()?;

@@ -63,7 +63,7 @@ pub fn noise(path: &Path, bytes: u64, seed: u64) -> anyhow::Result<()> {
 impl Releases {
     /// Keys and a repository in a new folder.
     pub fn make(dir: &Path) -> anyhow::Result<Self> {
-        let now = midshift_cli::clock::wall();
+        let now = midshift_agent::clock::wall();
         fs::create_dir_all(dir)?;
         let folder = Folder::create(&dir.join("repository"), &dir.join("keys"), Profile::Solo, now)?;
         Ok(Self { dir: dir.to_owned(), folder, targets_version: 0 })
@@ -91,7 +91,7 @@ impl Releases {
         fs::write(draft.join(build::DRAFT_FILE), text)?;
         let manifest = build::build(&draft, &built, &mut |_| {})?;
         let key = SecretKey::read(&self.keys().join("targets-1.pem"))?;
-        let (_, signed) = self.folder.add(&built, &[&key], midshift_cli::clock::wall())?;
+        let (_, signed) = self.folder.add(&built, &[&key], midshift_agent::clock::wall())?;
         match signed {
             Signed::Published(version) => self.targets_version = version,
             Signed::Pending => bail!("one key was not enough to sign"),

@@ -6,7 +6,7 @@
 use crate::questions::answer_questions;
 use crate::robot;
 use anyhow::Context;
-use midshift::robots::{AgentRun, IdentityFlags, StopFlags};
+use midshift::robots::{AgentRun, Config, IdentityFlags, StopFlags};
 use midshift::serve::{Serve, Software};
 use midshift_agent::bulk::Bulk;
 use midshift_agent::dial::TcpDial;
@@ -204,23 +204,18 @@ async fn agent(
         }
         now.wall.0.unsigned_abs()
     })?;
-    let run = AgentRun {
-        enroll_file: None,
+    let config = Config {
         robot_id: robot,
         server,
         data: home.join("data"),
-        site: None,
-        start: None,
-        seed: 1,
-        body_speed: 1.0,
-        no_faults: true,
-        person: false,
+        enroll_file: None,
         sets: Some(home.join("sets")),
         trust: Some(home.join("trust.json")),
         clock_unsynced: false,
         identity: IdentityFlags::default(),
         stop: StopFlags::default(),
     };
+    let run = AgentRun { config, site: None, start: None, seed: 1, body_speed: 1.0, no_faults: true, person: false };
     let hand = move |body: &SimHandle, clock: &Arc<dyn Clock>| {
         // Nobody else sets it.
         let _ = held.set((body.clone(), clock.clone()));

@@ -30,7 +30,7 @@ pub fn label(at: usize) -> String {
 impl People {
     /// Draws keys and signs the samples: settings only, which is all that simulated robots read.
     pub fn make(dir: &Path) -> anyhow::Result<Self> {
-        let made = samples::make(&dir.join("samples"), None, Signer::Throwaway, midshift_cli::clock::wall())?;
+        let made = samples::make(&dir.join("samples"), None, Signer::Throwaway, midshift_agent::clock::wall())?;
         let id = |bytes: &[u8]| BundleId::parse(&Digest::of(bytes).to_string());
         let bundles = made.bundles.iter().map(|(_, manifest)| id(&manifest.to_bytes())).collect::<Result<_, _>>()?;
         Ok(Self { repository: made.repository, keys: made.keys.context("throw-away keys")?, bundles })

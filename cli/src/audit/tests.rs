@@ -19,7 +19,7 @@ fn a_moment_is_a_time_or_how_long_ago() {
     assert_eq!(moment("2026-11-22T06:00:00Z"), Ok(Utc(1_795_327_200_000)));
     assert_eq!(moment("2026-11-22T08:00:00+02:00"), Ok(Utc(1_795_327_200_000)));
     let ago = moment("8h").unwrap_or_default();
-    assert!(ago.0 > 0 && ago < crate::clock::wall());
+    assert!(ago.0 > 0 && ago < midshift_agent::clock::wall());
     for wrong in ["", "yesterday", "2026-11-22", "12"] {
         assert!(moment(wrong).is_err(), "{wrong}");
     }

@@ -2,7 +2,7 @@
 
 use super::{handed, public_key, read_keys, told};
 use crate::client::Exit;
-use crate::clock;
+use midshift_agent::clock;
 use crate::out::{Format, Out, columns};
 use clap::{Subcommand, ValueEnum};
 use midshift_agent::trust::Trust;

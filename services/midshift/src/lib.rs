@@ -1,6 +1,7 @@
 //! The midshift binary as a library: wiring of services, `dev`, `serve`, robots in processes, and the commands that start them.
 //!
-//! Called by `main.rs`, by the tests and by the benchmarks. Only here are configuration, environment and the machine's clock read.
+//! Called by `main.rs`, by the tests and by the benchmarks. Of a server's
+//! configuration, environment and clock nothing is read elsewhere.
 
 pub mod background;
 pub mod backup;

@@ -169,7 +169,7 @@ async fn what_is_changed_in_the_database_is_named_by_verify_after_the_next_start
 /// Statements that put one row in the place of a whole chain: it says of itself that all before it was old and cut.
 fn forged(head: &Head) -> Vec<String> {
     let Head { n, hash: prev } = head;
-    let (next, at) = (n + 1, midshift_cli::clock::wall().0);
+    let (next, at) = (n + 1, midshift_agent::clock::wall().0);
     let said = format!(
         r#"{{"service":"identity","n":{next},"at_unix_ms":{at},"actor":"identity","action":"audit.cut","outcome":"DONE","cut":{{"n":{n},"hash":"{prev}"}}}}"#
     );

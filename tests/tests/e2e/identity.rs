@@ -334,7 +334,7 @@ async fn doctor_looks_at_certificates_tokens_rights_and_for_the_stop_service() -
     ensure!(stop.contains("midshift stop serve"), "{stop}");
 
     // What the clock jumped before the server was started again is told too.
-    let kept = serde_json::json!({ "step_ms": -7_200_000, "to_unix_ms": midshift_cli::clock::wall().0 });
+    let kept = serde_json::json!({ "step_ms": -7_200_000, "to_unix_ms": midshift_agent::clock::wall().0 });
     std::fs::write(server.data().join("clock-jump.json"), kept.to_string())?;
     server.kill_and_restart().await?;
     let output = call(&["doctor", "--server", &address, "--data", &data, "--stop-server", nobody])?;

@@ -96,8 +96,13 @@ impl Language {
     }
 }
 
-/// A robot in Python that knows nothing of midshift but the .proto files, and stands in `park-a` of the corridor.
-pub async fn minimal_robot(name: &str, server: SocketAddr, dir: &Path) -> anyhow::Result<Command> {
+/// A robot in Python that knows nothing of midshift but the .proto files, and stands in `park-a` of the corridor; with a line to the stop service at `stops`.
+pub async fn minimal_robot(
+    name: &str,
+    server: SocketAddr,
+    stops: Option<SocketAddr>,
+    dir: &Path,
+) -> anyhow::Result<Command> {
     let (line, authority) = (enrolment(server, name).await?.context("a site with a login")?, authority(server)?);
     let server = server.to_string();
     let (memory, journal) = (dir.join("robot.json").display().to_string(), dir.join("effects").display().to_string());
@@ -105,6 +110,10 @@ pub async fn minimal_robot(name: &str, server: SocketAddr, dir: &Path) -> anyhow
     let mut command = Language::Python.run("examples/minimal_robot.py", &arguments)?;
     command.args(["--at", "park-a", "0", "3000", "--speed-mm-s", "5000", "--act-ms", "1500"]);
     command.env("MIDSHIFT_ENROLL", &line).arg("--ca").arg(authority);
+    match stops {
+        Some(stops) => command.args(["--stop-server", &stops.to_string()]),
+        None => command.arg("--no-stop"),
+    };
     Ok(command)
 }
 
@@ -124,7 +133,7 @@ fn each_client_keeps_its_own_rules() -> anyhow::Result<()> {
         let text = [ran.stdout, ran.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
         ensure!(ran.status.success(), "{language:?}: {text}");
         let counted = match language {
-            Language::Python => text.contains("Ran 5 tests"),
+            Language::Python => text.contains("Ran 13 tests"),
             Language::Go => text.matches("--- PASS").count() == 5,
             Language::TypeScript => text.contains("# pass 5"),
         };

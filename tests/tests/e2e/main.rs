@@ -45,6 +45,7 @@ mod mid_shift;
 mod minimal_robot;
 mod night;
 mod old_site;
+mod own_robot;
 mod partition;
 mod played;
 mod proxy;

@@ -80,7 +80,7 @@ async fn a_robot_from_the_proto_files_alone_outlives_kills_and_a_cut_and_does_no
     let mut room = Room::open_on(&CORRIDOR.replace("speed_limit_mm_s = 1500", "speed_limit_mm_s = 5000")).await?;
     let (dir, proxy) = (&room.dir.path().to_owned(), Proxy::before(room.server.address).await?);
     let log = dir.join("robot.log");
-    let mut command = minimal_robot(NAME, proxy.address, dir).await?;
+    let mut command = minimal_robot(NAME, proxy.address, None, dir).await?;
     let mut robot = Running::start(&mut command, &log)?;
     room.until_held("park-a", NAME, true).await?;
 
@@ -149,7 +149,7 @@ async fn every_event_is_there_once(room: &Room) -> anyhow::Result<()> {
 async fn a_robot_from_the_proto_files_alone_refuses_an_offer_that_lay_in_a_buffer() -> anyhow::Result<()> {
     let room = Room::open_on(&CORRIDOR.replace("speed_limit_mm_s = 1500", "speed_limit_mm_s = 5000")).await?;
     let (dir, proxy) = (room.dir.path(), Proxy::before(room.server.address).await?);
-    let mut command = minimal_robot(NAME, proxy.address, dir).await?;
+    let mut command = minimal_robot(NAME, proxy.address, None, dir).await?;
     let _robot = Running::start(&mut command, &dir.join("robot.log"))?;
     room.until_held("park-a", NAME, true).await?;
     proxy.hold(true);
@@ -185,7 +185,7 @@ async fn a_robot_from_the_proto_files_alone_forgets_a_load_by_a_persons_word_and
     let dir = room.dir.path();
     // It remembers what somebody took off while it was switched off.
     std::fs::write(dir.join("robot.json"), r#"{"load": {"task_id": "", "item": "SKU-9"}}"#)?;
-    let mut command = minimal_robot(NAME, room.server.address, dir).await?;
+    let mut command = minimal_robot(NAME, room.server.address, None, dir).await?;
     let _robot = Running::start(&mut command, &dir.join("robot.log"))?;
     room.until_held("park-a", NAME, true).await?;
     room.submit("T1", NAME).await?;

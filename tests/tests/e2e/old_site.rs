@@ -14,7 +14,7 @@ use midshift::server::{Naive, Parts, Server};
 use midshift::storage::{Database, Storage};
 use midshift::tally;
 use midshift::throwaway::Throwaway;
-use midshift_cli::clock::wall;
+use midshift_agent::clock::wall;
 use midshift_cli::roles::Roles;
 use midshift_core::rows::Table;
 use midshift_core::site::{CORRIDOR, Site, text};

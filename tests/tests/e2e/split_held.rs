@@ -8,7 +8,7 @@ use crate::rolled_out::{Doors, begin_rollout, call, done, fleet};
 use crate::room::LIMIT;
 use crate::stack::Stack;
 use anyhow::ensure;
-use midshift_cli::clock::wall;
+use midshift_agent::clock::wall;
 use midshift_core::reason::Code;
 use midshift_core::site::DEMO;
 use midshift_sim::journal::{self, Effect};

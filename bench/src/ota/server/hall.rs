@@ -135,7 +135,7 @@ impl Rows {
     pub fn check(&self, people: &People, robots: usize, hearers: &mut Child) -> anyhow::Result<()> {
         ensure!(self.desired.len() == robots && self.robots.len() == robots, "rows are missing");
         let key = people.directive_key()?;
-        let (keys, now) = ([(key.id(), key)].into(), midshift_cli::clock::wall());
+        let (keys, now) = ([(key.id(), key)].into(), midshift_agent::clock::wall());
         for ((desired, revision), robot) in self.desired.iter().zip(&self.robots) {
             let id = &desired.robot_id;
             ensure!(*id == robot.robot_id && *revision == Revision(1), "{id} was assigned {} times", revision.0);

@@ -18,7 +18,7 @@ pub fn run(directives: usize, rounds: usize) -> anyhow::Result<Vec<Figure>> {
     let robots: Vec<RobotId> =
         (0..directives).map(|n| RobotId::parse(&format!("rbt-{n:05}"))).collect::<Result<_, _>>()?;
     let (bundle, rollout_id) = (BundleId::parse(&"5a".repeat(32))?, RolloutId::parse("bench-1")?);
-    let issued_at = midshift_cli::clock::wall();
+    let issued_at = midshift_agent::clock::wall();
     let signer = Signer(&key);
     let bytes = signed(&key, &robots[0], &bundle, &rollout_id, issued_at)?;
     let (mut whole, mut bare) = (Vec::new(), Vec::new());

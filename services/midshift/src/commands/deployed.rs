@@ -3,7 +3,8 @@
 
 use super::{AgentVerb, Args, Command, logs};
 use clap::{Args as _, FromArgMatches, Parser};
-use midshift_cli::enrol::{ENROLL, Machine};
+use midshift_agent::program::ENROLL;
+use midshift_cli::enrol::Machine;
 
 const UNITS: [(&str, &str); 3] = [
     ("midshift.service", include_str!("../../../../deploy/midshift.service")),
@@ -163,8 +164,8 @@ fn the_line_of_a_robot_is_taken_as_it_is_printed() {
     let shown = Args::try_parse_from(words.iter().map(String::as_str).chain(["--enroll", "mse.ID.SECRET.DIGEST"]));
     assert!(shown.is_err(), "other users of a machine see what stands on a command line");
     let Command::Agent(AgentVerb::Run(taken)) = read(&words).command else { panic!("{words:?}") };
-    assert_eq!((taken.robot_id.as_str(), taken.server.as_str()), ("r7", "hub:7401"));
-    assert_eq!(taken.identity.identity_server.as_deref(), Some("hub:7402"));
+    assert_eq!((taken.config.robot_id.as_str(), taken.config.server.as_str()), ("r7", "hub:7401"));
+    assert_eq!(taken.config.identity.identity_server.as_deref(), Some("hub:7402"));
     assert_eq!(taken.site, Some("/etc/hall.toml".into()));
-    assert_eq!(taken.stop.stop_server.as_deref(), Some("hub:18421"));
+    assert_eq!(taken.config.stop.stop_server.as_deref(), Some("hub:18421"));
 }

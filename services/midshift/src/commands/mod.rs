@@ -14,6 +14,7 @@ use crate::{dev, logs, robots, serve};
 use clap::{Parser, Subcommand};
 use midshift_agent::core::ExitReason;
 use midshift_agent::launcher::{self, ENVIRONMENT, SWITCHED};
+use midshift_agent::program::told_to_end;
 use midshift_agent::{environment, pulse};
 use midshift_cli::client::Exit;
 use midshift_cli::out::{Format, Out, Output};
@@ -150,14 +151,7 @@ fn interrupts() -> CancellationToken {
     let stop = CancellationToken::new();
     let cancel = stop.clone();
     tokio::spawn(async move {
-        let mut term = match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
-            Ok(term) => term,
-            Err(error) => return tracing::warn!(%error, "SIGTERM is not heard"),
-        };
-        tokio::select! {
-            _ = tokio::signal::ctrl_c() => {}
-            _ = term.recv() => {}
-        }
+        told_to_end().await;
         cancel.cancel();
     });
     stop

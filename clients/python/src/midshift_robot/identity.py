@@ -1,4 +1,4 @@
-"""Who a machine is at its site: the chapter "Who it is" of docs/robot-protocol.md as a program, for minimal_robot.py."""
+"""Who a machine is at its site: the chapter "Who it is" of docs/robot-protocol.md as a program."""
 
 import argparse
 import os
@@ -17,6 +17,8 @@ class Identity:
     """Who this machine is at its site: a key that never leaves it, and a certificate of that key for some days."""
 
     CERTIFICATE_LIFE_S = 7 * 24 * 3600
+    # Every server of a site is called so in its certificate.
+    OPTIONS = (("grpc.enable_retries", 0), ("grpc.use_local_subchannel_pool", 1), ("grpc.ssl_target_name_override", "midshift"))
 
     def __init__(self, args: argparse.Namespace, memory) -> None:
         self.server, self.robot_id, self.memory = args.server, args.robot_id, memory
@@ -26,15 +28,18 @@ class Identity:
                 sys.exit(f"not enrolled: run `midshift robot enroll {args.robot_id}` and give its secret with MIDSHIFT_ENROLL")
             self._enrol(args.ca.read_bytes(), line)
 
-    def channel(self) -> grpc.Channel:
+    @property
+    def is_enrolled(self) -> bool:
+        return bool(self.memory["identity"])
+
+    def channel(self, server: str) -> grpc.Channel:
         """A new connection, on which this machine shows who it is; in plain text where the site has no login."""
-        options = [("grpc.enable_retries", 0), ("grpc.use_local_subchannel_pool", 1)]
         mine = self.memory["identity"]
         if not mine:
-            return grpc.insecure_channel(self.server, options)
+            return grpc.insecure_channel(server, self.OPTIONS)
         if time.time() > mine["expires_unix_s"] - self.CERTIFICATE_LIFE_S / 2:
-            self._renew(mine, options)
-        return grpc.secure_channel(self.server, self._shown(self.memory["identity"]), options)
+            self._renew(mine)
+        return grpc.secure_channel(server, self._shown(self.memory["identity"]), self.OPTIONS)
 
     @staticmethod
     def _shown(mine: dict) -> grpc.ChannelCredentials:
@@ -56,15 +61,15 @@ class Identity:
         key = ec.generate_private_key(ec.SECP256R1())
         pem = (serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
         asked = enrolment.EnrolRequest(robot_id=self.robot_id, secret=secret, request_pem=self._request(key))
-        with grpc.secure_channel(self.server, grpc.ssl_channel_credentials(authority_pem)) as channel:
+        with grpc.secure_channel(self.server, grpc.ssl_channel_credentials(authority_pem), self.OPTIONS) as channel:
             answer = enrolment_service_pb2_grpc.EnrolmentServiceStub(channel).Enrol(asked, timeout=10)
         self._keep(key.private_bytes(*pem).decode(), answer)
 
-    def _renew(self, mine: dict, options: list) -> None:
+    def _renew(self, mine: dict) -> None:
         key = serialization.load_pem_private_key(mine["key_pem"].encode(), password=None)
         asked = enrolment.RenewCertificateRequest(robot_id=self.robot_id, request_pem=self._request(key))
         try:
-            with grpc.secure_channel(self.server, self._shown(mine), options) as channel:
+            with grpc.secure_channel(self.server, self._shown(mine), self.OPTIONS) as channel:
                 stub = enrolment_service_pb2_grpc.EnrolmentServiceStub(channel)
                 self._keep(mine["key_pem"], stub.RenewCertificate(asked, timeout=10))
         except grpc.RpcError as error:
