@@ -326,7 +326,7 @@ impl From<Status> for Exit {
 /// again what is known then. `take` is given nothing when the server ended the stream in order.
 ///
 /// # Errors
-/// What `open` says the first time; what `take` says; a refusal; a server that stays away, or cuts each stream soon, for longer than [`AWAY_MAX`]; what it heard cannot be written.
+/// What `open` says the first time; what `take` says; a refusal; a server that stays away, or cuts each stream soon, for longer than ten minutes; what it heard cannot be written.
 pub async fn follow<T, B>(
     out: &Out,
     open: impl AsyncFn() -> Result<Streaming<T>, Exit>,

@@ -112,7 +112,7 @@ pub async fn run(doctor: &Doctor, out: &Out) -> Result<(), Exit> {
 }
 
 async fn server(doctor: &Doctor, found: &mut Vec<Finding>) -> Result<(), Exit> {
-    let (call, now) = (&doctor.call, clock::wall());
+    let (call, now) = (&doctor.call, midshift_agent::clock::wall());
     let resolved = call.resolved()?;
     let channel = call.line().await?;
     // Without a login there is nobody to enrol and no token to make.
@@ -153,7 +153,7 @@ async fn wall(channel: &Line, now: Utc) -> Vec<Finding> {
 /// When what was signed ends: root and targets, which people sign, and the timestamp, which the server signs.
 async fn releases(call: &Call) -> Vec<Finding> {
     let mut found = match documents(call).await {
-        Ok(ends) => ends.into_iter().map(|end| end.finding(clock::wall())).collect(),
+        Ok(ends) => ends.into_iter().map(|end| end.finding(midshift_agent::clock::wall())).collect(),
         Err(finding) => vec![finding],
     };
     found.extend(room(call).await);
@@ -274,7 +274,7 @@ async fn robots(doctor: &Doctor) -> Result<(Vec<Finding>, Vec<String>), Exit> {
     let request = v1::ListRobotsRequest { page_size: 1_000, ..v1::ListRobotsRequest::default() };
     let mut client = call.telemetry().await?;
     let answer = client.list_robots(unary(request.clone())).await?;
-    let server = shown::clock("the server", answer.metadata(), clock::wall());
+    let server = shown::clock("the server", answer.metadata(), midshift_agent::clock::wall());
     let mut page = answer.into_inner();
     let mut robots = std::mem::take(&mut page.robots);
     while !page.next_page_token.is_empty() {

@@ -2,7 +2,7 @@
 //!
 //! An operational stop request, not a safety function. Invariant: nothing of the store, the task queue or the business server lies on its way. `serve`
 //! starts one where none is, leaves one that answers alone, and replaces one that hangs. Rooms: `started` is that, `manager` what a service manager hears, `first_start` says that one may begin with nothing engaged, `next` how one takes the place of another,
-//! `program` which program both start, where its files are and how long it may take.
+//! `program` which program both start and how long it may take.
 
 mod first_start;
 mod manager;

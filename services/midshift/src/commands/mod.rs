@@ -173,7 +173,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Launcher { .. } => unreachable!("runs before the runtime"),
         Command::Sim(verb) => sim::run(verb, out, interrupts()).await,
         Command::Client(command) => midshift_cli::run(command, out).await,
-        Command::Stop(stop) => stop::run(*stop, out, interrupts()).await,
+        Command::Stop(stop) => stop::run(*stop, out).await,
         Command::Certificate(verb) => certificate::run(*verb, interrupts(), out).await,
     }
 }

@@ -1,5 +1,6 @@
 //! `midshift stop …`: runs the stop service, checks its files, or asks one that runs.
 
+use super::interrupts;
 use crate::stop::{FOLDER, StopServe};
 use clap::{Args, Subcommand};
 use midshift_cli::Command;
@@ -7,7 +8,6 @@ use midshift_cli::client::Exit;
 use midshift_cli::out::{Format, Out};
 use midshift_cli::stop::{self, Engage, Request};
 use std::path::{Path, PathBuf};
-use tokio_util::sync::CancellationToken;
 
 /// Stops robots, at once and without asking back: an operational stop request; not a safety function, no performance level; the independent emergency stop is the robot
 /// maker's and the integrator's hardware.
@@ -49,12 +49,12 @@ impl Stop {
 }
 
 /// Runs one verb.
-pub async fn run(stop: Stop, out: &Out, shutdown: CancellationToken) -> Result<(), Exit> {
+pub async fn run(stop: Stop, out: &Out) -> Result<(), Exit> {
     let request = match stop.verb {
         None => Request::Engage(stop.engage),
         Some(Verb::Ask(verb)) => Request::Of(verb),
         Some(Verb::Verify { data }) => return verify(&data.join(FOLDER), out),
-        Some(Verb::Serve(args)) => return Ok(crate::stop::run(args, shutdown).await?),
+        Some(Verb::Serve(args)) => return Ok(crate::stop::run(args, interrupts()).await?),
     };
     midshift_cli::run(Command::Stop(Box::new(request)), out).await
 }
