@@ -106,6 +106,6 @@ mod tests {
         for n in 0..2 * limits::REFUSED_REMEMBERED {
             note_refusal(&mut view, Outline { kind: "tests", keys: vec![Key::new(Table::Incident, n.to_string())] });
         }
-        assert_eq!(view.refused.len(), limits::REFUSED_REMEMBERED);
+        assert_eq!(view.refused.count(), limits::REFUSED_REMEMBERED);
     }
 }

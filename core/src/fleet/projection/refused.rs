@@ -87,7 +87,7 @@ impl Refused {
         }
     }
     /// How many decisions are remembered.
-    pub fn len(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.known.len()
     }
     /// Robots of decisions that are looked at again.
