@@ -3,7 +3,7 @@
 
 use crate::figure::{Figure, percentile};
 use crate::old_store::{self, OldArgs};
-use midshift_core::fleet::view::{Rowed, View};
+use midshift_core::fleet::projection::{Rowed, View};
 use midshift_core::fleet::{Board, Pace, Plan, Slice, cycle, found};
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::{Inventory, ReportedState, Vitals};

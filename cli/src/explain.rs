@@ -2,7 +2,7 @@
 
 use super::client::Exit;
 use super::out::{Format, Out, plain};
-use midshift_core::fleet::standing::WAITS_FOR;
+use midshift_core::fleet::WAITS_FOR;
 use midshift_core::reason::Code;
 use midshift_proto::common::v1::Reason;
 

@@ -143,7 +143,7 @@ pub struct AreaPolicy {
     /// No people walk here, as its site says: a robot bears the silence of the stop service longer. Set by fleet for robots; no person puts it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub without_people: bool,
-    /// Milliseconds of link time after which what a robot says of itself, and an open breaker, is an incident: see [`crate::fleet::lasting`].
+    /// Milliseconds of link time after which what a robot says of itself, and an open breaker, is an incident: see [`crate::fleet::explanation::lasting`].
     #[serde(default = "incident_after_ms")]
     pub incident_after_ms: u64,
     /// What roll-outs of software must keep to.

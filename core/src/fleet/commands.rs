@@ -1,12 +1,15 @@
 //! What people ask of fleet directly: cordon, uncordon and retire, a word about a load, rules of an area, clearing a place, closing an
 //! incident. Each is one item, answered after its commit.
 
-use super::Tx;
-pub use super::asked::Command;
-use super::rows::{Cordon, HolderState, Place, PlaceHolder, RobotControl};
-use super::view::View;
-use super::{Board, arrivals, drain, heard, incidents, load};
 use crate::audit::{self, Note};
+use crate::fleet::decision::incidents;
+use crate::fleet::decision::plan::Tx;
+use crate::fleet::maintenance::drain;
+pub use crate::fleet::projection::command::Command;
+use crate::fleet::projection::liveness::{self, Board};
+use crate::fleet::projection::rows::{Cordon, HolderState, Place, PlaceHolder, RobotControl};
+use crate::fleet::projection::state::View;
+use crate::fleet::tasks::{arrivals, claims, load};
 use crate::identity::Caller;
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
@@ -81,7 +84,7 @@ pub fn check(view: &View, board: &Board, now: &Now, command: &Command, seen: Opt
 
 /// One inside is believed while it is heard; one that may still enter is let go only when its permission must be over.
 fn may_be_there(board: &Board, now: &Now, holder: &PlaceHolder) -> bool {
-    match heard::presence(board, &holder.robot_id, now) {
+    match liveness::presence(board, &holder.robot_id, now) {
         Presence::Online => true,
         Presence::Suspect | Presence::Updating => holder.state != HolderState::Inside,
         Presence::Offline => false,
@@ -160,7 +163,8 @@ fn may_disown(view: &View, board: &Board, now: &Now, robot_id: &RobotId, attempt
         let reason = Reason::new(Code::NotAllowedNow, what).with("robot_id", robot_id).with("attempt", attempt);
         Err(Refusal::new(Kind::Precondition, reason))
     };
-    let Some(live) = board.get(robot_id).filter(|_| heard::presence(board, robot_id, now) == Presence::Online) else {
+    let Some(live) = board.get(robot_id).filter(|_| liveness::presence(board, robot_id, now) == Presence::Online)
+    else {
         return no("the robot is not heard");
     };
     let lists = live.report.attempts.iter().any(|r| r.attempt == *attempt && !r.state.is_over());
@@ -168,7 +172,7 @@ fn may_disown(view: &View, board: &Board, now: &Now, robot_id: &RobotId, attempt
         () if !lists => no("the robot does not list this attempt as its own"),
         () if view.held_by(robot_id) == Some(attempt) => no("the server knows this attempt: cancel its task"),
         () if live.report.vitals.speed_mm_s != 0 => no("the robot moves: stop it first"),
-        () if super::claims::is_ahead(view, robot_id, now) => {
+        () if claims::is_ahead(view, robot_id, now) => {
             no("the robot knows more than the store, which was restored: it is still heard out")
         }
         () => Ok(()),

@@ -5,7 +5,7 @@
 use super::rows::{Countdown, Phase, Rollout, RolloutRobot, Step};
 use super::view::View;
 use super::{Board, hear, infrastructure, moves, robots, turns};
-use crate::fleet::heard;
+use crate::fleet::liveness;
 use crate::fleet::rows::{Drain, DrainState};
 use crate::ids::RobotId;
 use crate::limits;
@@ -38,7 +38,7 @@ pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rol
 /// A robot that is out of work and is not heard waits for nothing else: since when, and until when nobody is told.
 fn silent(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
     r.drain_id.as_ref().filter(|id| view.drain(id).is_some_and(Drain::is_on))?;
-    if heard::presence(board, &r.robot_id, now) != Presence::Offline {
+    if liveness::presence(board, &r.robot_id, now) != Presence::Offline {
         return None;
     }
     let left_ms = rollout.spec.lost_after_ms.saturating_sub(infrastructure::silent_ms(view, board, now, &r.robot_id));
@@ -62,7 +62,7 @@ fn named(view: &View, board: &Board, now: &Now, rollout: &Rollout, by: Reason) -
         }
         _ => return by,
     };
-    let name = |id: &&RobotId| match heard::presence(board, id, now) {
+    let name = |id: &&RobotId| match liveness::presence(board, id, now) {
         Presence::Offline => format!("{id} (not heard)"),
         _ => format!("{id}"),
     };

@@ -6,7 +6,7 @@
 use super::Board;
 use super::rows::{Pause, Rollout, RolloutRobot, Step};
 use super::view::View;
-use crate::fleet::heard;
+use crate::fleet::liveness;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::robot::{Duty, Presence};
@@ -67,7 +67,7 @@ pub fn controls(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> Resu
 fn keeps_contact(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> bool {
     let long_ms = limits::LOST_AFTER.as_ms() - limits::OFFLINE_AFTER.as_ms();
     let unbroken = view.contacts.get(robot_id).is_some_and(|c| now.link.since(c.since).as_ms() >= long_ms);
-    unbroken && heard::presence(board, robot_id, now) != Presence::Offline
+    unbroken && liveness::presence(board, robot_id, now) != Presence::Offline
 }
 
 /// It changes nothing now, and was in contact when the robot was heard last: one in a store room says nothing of the network.

@@ -7,7 +7,7 @@ use super::Board;
 use super::infrastructure::is_open_to;
 use super::rows::{Rollout, RolloutRobot};
 use super::view::View;
-use crate::fleet::heard;
+use crate::fleet::liveness;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::robot::{HardwareStop, Mode, Presence, StopLevel};
@@ -30,7 +30,7 @@ fn is_long(stood: SiteDuration) -> bool {
 
 /// How long a robot has stood with work that it may do. None: it has none, is not heard, or something else holds it.
 fn stood(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Option<SiteDuration> {
-    let live = board.get(robot_id).filter(|_| heard::presence(board, robot_id, now) != Presence::Offline)?;
+    let live = board.get(robot_id).filter(|_| liveness::presence(board, robot_id, now) != Presence::Offline)?;
     let is_on_its_way =
         |state: WorkState| matches!(state, WorkState::Accepted | WorkState::Navigating | WorkState::Executing);
     let has_work = live.report.attempts.iter().any(|a| is_on_its_way(a.state));

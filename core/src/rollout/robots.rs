@@ -10,7 +10,7 @@ use super::turns::{is_late, is_newcomer, is_on, is_retried, waits_out};
 use super::view::View;
 use super::{Board, infrastructure, jams, matching, served, verdict};
 use crate::authority::Authority;
-use crate::fleet::heard;
+use crate::fleet::liveness;
 use crate::fleet::rows::DrainState;
 use crate::ids::{AreaId, RobotId, RolloutId};
 use crate::limits;
@@ -79,7 +79,7 @@ pub fn next(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollou
     if view.duty(&r.robot_id) == Duty::Retired && !r.step.is_over() {
         return Some(Move::Skip(Code::SkippedRetired.into()));
     }
-    let is_silent = heard::presence(board, &r.robot_id, now) == Presence::Offline;
+    let is_silent = liveness::presence(board, &r.robot_id, now) == Presence::Offline;
     if r.lost.is_some() && !is_silent {
         return Some(Move::Heard);
     }

@@ -9,7 +9,7 @@ use super::spec::{SmallWave, SmallWaveFailure};
 use super::stamp::Stamp;
 use super::view::View;
 use super::{Board, Tx, effort};
-use crate::fleet::heard;
+use crate::fleet::liveness;
 use crate::fleet::rows::RobotCounter;
 use crate::gates::{self, FEW_ROBOTS, RobotOutcomes, Suspicion, TaskTally};
 use crate::ids::{AreaId, RobotId, RolloutId};
@@ -94,7 +94,7 @@ pub fn see_wave(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> See
 
 /// It is not heard at this moment: as long as it is on trial it is not called clean.
 pub fn is_dark(board: &Board, now: &Now, r: &RolloutRobot) -> bool {
-    heard::presence(board, &r.robot_id, now) == Presence::Offline
+    liveness::presence(board, &r.robot_id, now) == Presence::Offline
 }
 
 /// Counts robots. `came_through`: whether one on trial counts for the bundle.

@@ -10,7 +10,7 @@ use super::rows::{
 };
 use super::turns::waits_out;
 use crate::fleet::Board;
-use crate::fleet::heard;
+use crate::fleet::liveness;
 use crate::fleet::rows::{AreaBudget, Drain, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
 use crate::ids::{AreaId, DrainId, RobotId, RolloutId};
 use crate::limits;
@@ -433,7 +433,7 @@ impl View {
     /// Whether a robot is heard. After a start of the service everybody counts as heard for as long as a robot may take to come back.
     pub fn is_heard(&self, board: &Board, now: &Now, robot: &RobotId) -> bool {
         let begun = now.link.since(self.started.link) <= limits::OFFLINE_AFTER;
-        begun || heard::presence(board, robot, now) != Presence::Offline
+        begun || liveness::presence(board, robot, now) != Presence::Offline
     }
     /// The area in which a robot is.
     pub fn area_of(&self, live: &Live) -> Option<AreaId> {

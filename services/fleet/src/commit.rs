@@ -7,8 +7,8 @@
 
 use crate::reconcile::{Loop, Replies};
 use crate::{Asked, Request};
-use midshift_core::fleet::view::named;
-use midshift_core::fleet::{Plan, obeyed, put_right, refused};
+use midshift_core::fleet::projection::named;
+use midshift_core::fleet::{Plan, obeyed, put_right, refusals};
 use midshift_core::limits;
 use midshift_core::picture::{self, Outline};
 use midshift_core::reason::{Code, Kind, Refusal};
@@ -117,7 +117,7 @@ impl Loop {
             tracing::error!(seq = seq.0, sent.kind, "an entry of the log cannot be obeyed and is passed over");
             self.view.unusable.insert(seq);
         } else {
-            refused::undone(&mut self.view, Outline::new(sent.kind, sent.keys.iter()));
+            refusals::undone(&mut self.view, Outline::new(sent.kind, sent.keys.iter()));
         }
     }
 

@@ -1,10 +1,10 @@
 //! Rows and explanations as their messages. Nothing is decided here.
 
 use midshift_core::fleet::explain::{RobotExplanation, TaskExplanation};
+use midshift_core::fleet::projection::View;
 use midshift_core::fleet::rows::{
     Cordon, HoldToken, HolderState, Incident, Place, RobotControl, RobotCounter, RobotHolder,
 };
-use midshift_core::fleet::view::View;
 use midshift_core::fleet::{Board, load, starts};
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::Duty;

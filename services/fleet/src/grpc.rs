@@ -4,7 +4,7 @@ use crate::{FleetService, encode};
 use midshift_core::fleet::commands::Command;
 use midshift_core::fleet::objects::{sees_incident, sees_place, sees_robot, sees_task};
 use midshift_core::fleet::rows::Incident;
-use midshift_core::fleet::{explain, view::View};
+use midshift_core::fleet::{explain, projection::View};
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId};
 use midshift_core::limits;

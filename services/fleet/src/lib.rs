@@ -15,7 +15,7 @@ pub use retention::prune;
 use midshift_core::fleet::Board;
 use midshift_core::fleet::commands::Command;
 use midshift_core::fleet::maps::MapChange;
-use midshift_core::fleet::view::View;
+use midshift_core::fleet::projection::View;
 use midshift_core::identity::Caller;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::rows::Revision;

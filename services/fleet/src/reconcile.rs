@@ -7,7 +7,7 @@
 //! say so for a while reads the rows again before it does.
 
 use crate::{Asked, Look, MapOutdated, Parts, Request};
-use midshift_core::fleet::view::{self, View};
+use midshift_core::fleet::projection::{self, View};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, explain, found, maps, objects};
 use midshift_core::identity::Actor;
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
@@ -214,8 +214,8 @@ impl Loop {
         self.take_part().await?;
         self.own.clear();
         let Self { seat, parts, .. } = self;
-        let alive = view::alive();
-        let reading = parts.store.read(&alive, view::named);
+        let alive = projection::alive();
+        let reading = parts.store.read(&alive, projection::named);
         let snapshot = lead::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
         let now = self.parts.clock.now();
         let served = self.view.serving(&now);

@@ -7,8 +7,8 @@
 //!
 //! Called by the binary now and then.
 
+use midshift_core::fleet::projection;
 use midshift_core::fleet::rows::RobotCounter;
-use midshift_core::fleet::view;
 use midshift_core::ids::{AttemptId, Subject};
 use midshift_core::limits;
 use midshift_core::privacy;
@@ -50,7 +50,7 @@ async fn prune_commands(store: &dyn Store, wall: Utc) -> Result<u64, Error> {
 async fn named(store: &dyn Store) -> Result<BTreeSet<Key>, Error> {
     let live = Phase::ALL.into_iter().filter(|p| !p.is_terminal()).map(Phase::number);
     let parts = [Part::InStates(Table::TaskState, live.collect()), Part::Whole(Table::RobotAuthority)];
-    Ok(store.read(&parts, view::named).await?.rows.into_iter().map(|row| row.key).collect())
+    Ok(store.read(&parts, projection::named).await?.rows.into_iter().map(|row| row.key).collect())
 }
 
 async fn prune_tasks(store: &dyn Store, now: Utc) -> Result<u64, Error> {

@@ -5,8 +5,8 @@
 use anyhow::Context;
 use midshift_cli::site_file::Loaded;
 use midshift_core::fleet::maps::{MapChange, in_the_way};
+use midshift_core::fleet::projection::{View, alive, named};
 use midshift_core::fleet::rows::SiteRow;
-use midshift_core::fleet::view::{View, alive, named};
 use midshift_core::site::{Site, read_stored};
 use midshift_core::time::Now;
 use midshift_store::{Store, load};

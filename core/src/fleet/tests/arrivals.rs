@@ -1,10 +1,13 @@
 //! A robot that says that its task is done: it is believed if it was where that is done, or if nobody can tell.
 
 use super::Rig;
+use crate::fleet::assignment::filters;
 use crate::fleet::commands::{self, Command};
+use crate::fleet::facts::inbox;
 use crate::fleet::maps::MapChange;
 use crate::fleet::rows::{HolderState, PlaceHolder};
-use crate::fleet::{Board, Pace, Plan, Tally, claims, found, inbox, screen};
+use crate::fleet::tasks::claims;
+use crate::fleet::{Board, Pace, Plan, Tally, found};
 use crate::ids::{AttemptId, PlaceId, RobotId, WaypointId};
 use crate::reason::{Code, Reason};
 use crate::robot::{FAULT_DISBELIEVED, Lane, WorkState};
@@ -55,7 +58,7 @@ fn take(rig: &mut Rig, what: InboxItem) {
     let lane = Lane::Event;
     let entry = InboxEntry { robot_id: robot_id(), session_epoch: 1, ring, lane, what, stamp_in_future: false };
     let (now, board) = (rig.now, rig.board.clone());
-    Plan::default().decide(&mut rig.view, now, "r1", |tx| inbox::take(tx, &entry, &board, &mut Tally::default()));
+    Plan::default().decide(&mut rig.view, now, "r1", |tx| inbox::obey_entry(tx, &entry, &board, &mut Tally::default()));
 }
 
 fn says(rig: &mut Rig, event: RobotEvent) {
@@ -125,13 +128,13 @@ fn a_robot_that_never_left_its_place_is_not_believed_and_gets_no_work() {
     let failures: Vec<_> = rig.view.counters.values().map(|counter| counter.row.failures.clone()).collect();
     assert_eq!(failures, [BTreeMap::from([(FAULT_DISBELIEVED, 1)])], "it counts against what it runs");
     assert_eq!(rig.view.held_by(&robot_id()), None, "it has let go by its own word");
-    let why = screen::robot(&rig.view, &rig.board, &robot_id(), &rig.now).expect_err("no work");
+    let why = filters::robot(&rig.view, &rig.board, &robot_id(), &rig.now).expect_err("no work");
     assert_eq!(why.code, Code::GoalNotEntered);
     let (incident_id, reason) = ("GOAL_NOT_ENTERED:r1".to_owned(), "a wrong map in it".to_owned());
     let close = Command::CloseIncident { incident_id, reason };
     let (now, board) = (rig.now, rig.board.clone());
     Plan::default().decide(&mut rig.view, now, "anna", |tx| commands::apply(tx, &board, &close, "anna"));
-    let why = screen::robot(&rig.view, &rig.board, &robot_id(), &rig.now).err();
+    let why = filters::robot(&rig.view, &rig.board, &robot_id(), &rig.now).err();
     assert!(why.is_none_or(|why| why.code != Code::GoalNotEntered), "a person has looked");
 }
 

@@ -2,7 +2,8 @@
 
 use super::Rig;
 use crate::fleet::rows::{HolderState, Incident, Place, PlaceHolder};
-use crate::fleet::{Pace, Plan, closures, incidents, places};
+use crate::fleet::traffic::{closures, places};
+use crate::fleet::{Pace, Plan, incidents};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::Code;
 use crate::task::AttemptPhase;
@@ -45,9 +46,9 @@ fn a_robot_that_was_only_let_in_closes_its_own_seat_and_one_that_entered_the_who
     {
         let rig = silent(state);
         let place = &rig.view.places["wait-a"].row;
-        assert_eq!(closures::is_whole(place, &place.holders[0]), is_whole, "{state:?}");
+        assert_eq!(place.is_closed_whole_by(&place.holders[0]), is_whole, "{state:?}");
         let narrow = Place { capacity: 1, ..place.clone() };
-        assert!(closures::is_whole(&narrow, &narrow.holders[0]), "there is no other seat");
+        assert!(narrow.is_closed_whole_by(&narrow.holders[0]), "there is no other seat");
     }
 }
 

@@ -2,7 +2,9 @@
 
 use super::Rig;
 use crate::fleet::rows::{HolderState, PlaceHolder};
-use crate::fleet::{Plan, claims, incidents, places};
+use crate::fleet::tasks::claims;
+use crate::fleet::traffic::places;
+use crate::fleet::{Plan, incidents};
 use crate::ids::{PlaceId, RobotId};
 use crate::limits::{CROWD_NAMED_MAX, INCIDENTS_OF_ROBOT_MAX};
 use crate::reason::{Code, Reason};

@@ -1,8 +1,9 @@
 //! Labels that people give a robot go before what it says itself.
 
 use super::super::commands::{self, Command};
-use super::super::{Slice, screen};
 use super::*;
+use crate::fleet::Slice;
+use crate::fleet::tasks::eligibility;
 use crate::reason::Refusal;
 
 fn label(rig: &mut Rig, labels: &[(&str, &str)], removed: &[&str]) -> Result<(), Refusal> {
@@ -19,7 +20,7 @@ fn label(rig: &mut Rig, labels: &[(&str, &str)], removed: &[&str]) -> Result<(),
 fn could(rig: &Rig) -> bool {
     let id = TaskId::parse("t1").expect("an id");
     let (task, intake) = rig.view.task(&id).zip(rig.view.intake(&id)).expect("a task");
-    screen::could_ever(&rig.view, task, intake, &mut Slice::default()).is_ok()
+    eligibility::could_ever(&rig.view, task, intake, &mut Slice::default()).is_ok()
 }
 
 fn rig() -> Rig {

@@ -1,9 +1,10 @@
 //! What lasts is told to a person, and closes by itself.
 
 use super::Rig;
+use crate::fleet::explanation::lasting;
+use crate::fleet::projection::Rowed;
 use crate::fleet::rows::RobotControl;
-use crate::fleet::view::Rowed;
-use crate::fleet::{Plan, incidents, lasting};
+use crate::fleet::{Plan, incidents};
 use crate::ids::RobotId;
 use crate::policy::AreaPolicy;
 use crate::reason::Code;

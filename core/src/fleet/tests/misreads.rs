@@ -1,7 +1,8 @@
 //! Robots that are refused because of what they say: people hear why, until such a robot is served again.
 
 use super::Rig;
-use crate::fleet::{Plan, explain, incidents, misreads};
+use crate::fleet::facts::misreads;
+use crate::fleet::{Plan, explain, incidents};
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
 use std::sync::Arc;

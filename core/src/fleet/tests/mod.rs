@@ -14,7 +14,7 @@ mod opened;
 mod order;
 mod unexplained;
 
-use super::view::{Rowed, View};
+use super::projection::{Rowed, View};
 use super::{Board, Pace, Plan, cycle};
 use crate::ids::{AttemptId, RobotId, TaskId, WaypointId};
 use crate::reason::Reason;
@@ -149,7 +149,7 @@ impl Rig {
     /// Why a task is where it is.
     fn why(&self, task_id: &TaskId) -> Option<Reason> {
         let (task, intake) = self.view.task(task_id).zip(self.view.intake(task_id)).expect("a task");
-        super::standing::of_task(&self.view, &self.board, &self.now, task, intake)
+        super::explanation::standing::of_task(&self.view, &self.board, &self.now, task, intake)
     }
 
     fn task(&self, id: &str) -> &TaskState {

@@ -1,8 +1,8 @@
 //! What opens a task, whatever its robot says of that.
 
 use super::*;
-use crate::fleet::inbox;
-use crate::fleet::plausible::passes_irreversible;
+use crate::fleet::facts::inbox;
+use crate::fleet::tasks::plausible::passes_irreversible;
 use crate::ids::Subject;
 use crate::robot::Load;
 use crate::work::{AttemptReport, WorkStats};

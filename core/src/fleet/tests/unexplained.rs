@@ -1,9 +1,10 @@
 //! What stands without a reason is counted; what has one is not.
 
 use super::{BEGIN, Rig};
+use crate::fleet::explanation::{standing, unexplained};
+use crate::fleet::projection::Rowed;
 use crate::fleet::rows::Cordon;
-use crate::fleet::view::Rowed;
-use crate::fleet::{Pace, Plan, standing, unexplained};
+use crate::fleet::{Pace, Plan};
 use crate::ids::{RobotId, StopId, TaskId};
 use crate::reason::{Code, Reason};
 use crate::robot::{StopLevel, WorkState};

@@ -277,7 +277,8 @@ fn a_robot_that_carries_the_item_of_a_task_that_is_tried_again_ends_it_before_it
     opened(&mut rig, 0, Phase::Queued);
     rig.ticks(2);
     assert_eq!(drain(&rig), DrainState::Draining);
-    let work = |rig: &Rig, n: usize| crate::fleet::screen::robot(&rig.fleet, &rig.board, &robot_id(n), &rig.now);
+    let work =
+        |rig: &Rig, n: usize| crate::fleet::assignment::filters::robot(&rig.fleet, &rig.board, &robot_id(n), &rig.now);
     assert_eq!(work(&rig, 0), Ok(()), "it may be given the rest of its task");
     assert_eq!(work(&rig, 1), Ok(()));
     rig.robots[0].load = None;

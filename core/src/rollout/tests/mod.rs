@@ -34,10 +34,11 @@ use super::rows::{AreaBundle, Bundle, Outcome, Phase, RobotSoftware, Rollout, Ro
 use super::spec::{RolloutSpec, Wave};
 use super::view::{Slot, View, WHOLE};
 use super::{Board, Order, Plan, Sign, absorb, cycle};
+use crate::fleet;
+use crate::fleet::maintenance::{budget, drain};
 use crate::fleet::rows::{
     DrainState, HolderState, Place, PlaceHolder, RobotAuthority, RobotControl, RobotCounter, RobotHolder,
 };
-use crate::fleet::{self, budget, drain};
 use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId, WaypointId};
 use crate::maintenance::ReleasedBy;
 use crate::policy::AreaPolicy;
@@ -144,7 +145,7 @@ struct Rig {
     feed: Vec<Entry>,
     ota: View,
     ota_at: usize,
-    fleet: fleet::view::View,
+    fleet: fleet::projection::View,
     fleet_at: usize,
     board: Board,
     heard: BTreeSet<RobotId>,
@@ -172,7 +173,7 @@ impl Rig {
             feed: Vec::new(),
             ota: View::new(site.clone(), now, now),
             ota_at: 0,
-            fleet: fleet::view::View::new(site, now, now),
+            fleet: fleet::projection::View::new(site, now, now),
             fleet_at: 0,
             board: Board::new(),
             heard: BTreeSet::new(),

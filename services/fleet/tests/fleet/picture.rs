@@ -1,8 +1,8 @@
 //! Fleet's picture of the rows: kept by the feed and built anew, it is the same.
 
 use crate::harness::{Answer, World, jam, obstacle};
+use midshift_core::fleet::projection::{View, alive, named};
 use midshift_core::fleet::rows::{HolderState, Place, RobotAuthority, RobotHolder};
-use midshift_core::fleet::view::{View, alive, named};
 use midshift_core::fleet::{Board, Plan, absorb};
 use midshift_core::reason::Code;
 use midshift_core::robot::{HardwareStop, Mode};

@@ -1,7 +1,7 @@
 //! Turns: questions and the plan wait for each other only so long, counted in questions and in decisions.
 
 use crate::harness::World;
-use midshift_core::fleet::view::View;
+use midshift_core::fleet::projection::View;
 use midshift_core::limits;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;

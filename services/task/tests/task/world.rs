@@ -1,7 +1,8 @@
 //! A service over a store in memory, and somebody who plays fleet: either by core's own law or row by row.
 
+use midshift_core::fleet::projection::{self, View};
 use midshift_core::fleet::rows::HoldToken;
-use midshift_core::fleet::{Board, LOGS, Plan, absorb, view, view::View};
+use midshift_core::fleet::{Board, LOGS, Plan, absorb};
 use midshift_core::identity::RobotIdentity;
 use midshift_core::ids::{AttemptId, RobotId, SiteId, StopId, Subject, TaskId};
 use midshift_core::robot::StopLevel;
@@ -90,7 +91,7 @@ impl World {
     pub async fn fleet_turns(&self) {
         let now = At(NOON).now();
         let mut view = View::new(self.site.clone(), now, now);
-        let snapshot = self.store.read(&view::alive(), view::named).await.expect("a snapshot");
+        let snapshot = self.store.read(&projection::alive(), projection::named).await.expect("a snapshot");
         view.load(&snapshot.rows, snapshot.seq).expect("rows that can be read");
         let begin = view.marks.get("fleet").map_or(NOON_SEQ, |m| m.row.seq);
         let page = self.store.feed(begin, LOGS, 5_000).await.expect("a feed");

@@ -1,0 +1,85 @@
+//! Brings the queue up to now: marks tasks that are ready, and gives to a person what can never be done or waits for too long.
+//!
+//! Called once a cycle, before tasks are given. Invariant: a turn looks at a bounded number of tasks; the others follow in the next.
+
+use crate::fleet::decision::incidents;
+use crate::fleet::decision::plan::Plan;
+use crate::fleet::projection::index::advance;
+use crate::fleet::projection::queue::{TASKS_PER_TURN, Wait};
+use crate::fleet::projection::state::View;
+use crate::fleet::tasks::transitions::{News, happen};
+use crate::fleet::tasks::{eligibility, timers};
+use crate::ids::TaskId;
+use crate::limits;
+use crate::reason::{Code, Reason};
+use crate::task::Event;
+use crate::time::{Now, Utc};
+
+/// Brings the queue up to now: notes since when a task is ready, arms what counts from then, and gives to a person what can never be ready.
+pub(in crate::fleet) fn settle(view: &mut View, now: Now, plan: &mut Plan) {
+    advance(view, now.utc);
+    for task_id in view.queue.failed.iter().take(TASKS_PER_TURN).cloned().collect::<Vec<_>>() {
+        let why = view.queue.waiting.get(&task_id).and_then(|w| w.wait.reason());
+        if plan.is_cut() {
+            return;
+        }
+        ask_person(view, now, &task_id, why.as_ref(), plan);
+    }
+    let moved: Vec<TaskId> = view.queue.moved.iter().take(TASKS_PER_TURN).cloned().collect();
+    for task_id in moved {
+        if plan.is_cut() {
+            return;
+        }
+        let is_unmarked = view.queue.waiting.get(&task_id).is_some_and(|w| w.wait == Wait::Mark);
+        plan.decide(view, now, "fleet", |tx| {
+            if is_unmarked && let Some(mut task) = tx.view.task(&task_id).cloned() {
+                task.ready_since = Some(now.utc);
+                tx.put(task, "task.ready");
+            }
+            timers::count_readiness(tx, &task_id);
+        });
+        view.queue.moved.remove(&task_id);
+    }
+    check_robots(view, now, plan);
+}
+
+/// Gives a waiting task to a person.
+fn ask_person(view: &mut View, now: Now, task_id: &TaskId, why: Option<&Reason>, plan: &mut Plan) {
+    plan.decide(view, now, "fleet", |tx| {
+        happen(tx, task_id, News::of(Event::ScheduleToStart, why));
+    });
+}
+
+/// A task that is ready for long and that no known robot could ever do goes to a person.
+fn check_robots(view: &mut View, now: Now, plan: &mut Plan) {
+    while let Some(task_id) = view.queue.unchecked.first().filter(|_| !plan.is_cut()).cloned() {
+        view.queue.unchecked.remove(&task_id);
+        let Some((task, intake)) = view.task(&task_id).zip(view.intake(&task_id)) else { continue };
+        if let Err(why) = eligibility::could_ever(view, task, intake, &mut plan.slice) {
+            ask_person(view, now, &task_id, Some(&why), plan);
+        }
+    }
+}
+
+/// One incident of the site tells of a backlog. It closes by itself, and opens again after a pause.
+pub(in crate::fleet) fn tell_backlog(view: &mut View, now: Now, plan: &mut Plan) {
+    let id = format!("{}:{}", Code::TaskBacklog, view.site.site_id());
+    let known = view.incidents.get(&id).map(|incident| &incident.row);
+    let old = view.queue.oldest().filter(|(since, _)| now.ms_since(*since) > limits::BACKLOG_AGE.as_ms());
+    match (old, known.map(|incident| &incident.closed)) {
+        (None, Some(None)) => {
+            let why = "no task waits longer than an hour";
+            plan.decide(view, now, "fleet", |tx| incidents::close(tx, &id, why, "fleet"));
+        }
+        (Some((since, task_id)), closed) => {
+            let rested = |at: Utc| now.ms_since(at) >= limits::BACKLOG_PAUSE.as_ms();
+            if closed.is_some_and(|closed| closed.as_ref().is_none_or(|closed| !rested(closed.at))) {
+                return;
+            }
+            let reason = Reason::from(Code::TaskBacklog).with("oldest_task_id", task_id).with("since", since.rfc3339());
+            let reason = reason.with("tasks", view.queue.ready.len());
+            plan.decide(view, now, "fleet", |tx| incidents::open_as(tx, id, reason, None, None));
+        }
+        (None, _) => {}
+    }
+}

@@ -1,0 +1,72 @@
+//! Counts what stands still for so long that somebody would ask, and nobody could say why.
+//!
+//! Called once a sweep. Each time it looks at some robots with work and at some tasks, and goes on where it ended. Invariant: what stands
+//! without a reason for [`limits::UNEXPLAINED_AFTER`] is counted once, until it has a reason again.
+
+use super::standing;
+use crate::fleet::assignment::filters;
+use crate::fleet::decision::plan::Plan;
+use crate::fleet::projection::liveness::Board;
+use crate::fleet::projection::state::View;
+use crate::ids::{RobotId, TaskId};
+use crate::limits;
+use crate::task::{Phase, TaskState};
+use crate::time::Now;
+use std::collections::BTreeMap;
+use std::ops::Bound;
+
+/// Looks at the next robots and tasks.
+pub(in crate::fleet) fn count_unexplained(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
+    let mut found: Vec<(String, bool)> = Vec::new();
+    let robots = next(&view.authority, &view.unexplained.robot);
+    for id in &robots {
+        let Ok(robot_id) = RobotId::parse(id) else { continue };
+        let has_work = view.held_by(&robot_id).is_some();
+        let why = standing::of_robot(view, board, &now, &robot_id).is_some_and(|why| standing::is_told(&why));
+        found.push((format!("robot {id}"), !has_work || why));
+    }
+    let tasks = next(&view.tasks, &view.unexplained.task);
+    let idle: Vec<&RobotId> = board.keys().filter(|id| filters::robot(view, board, id, &now).is_ok()).collect();
+    for id in &tasks {
+        let task = TaskId::parse(id).ok().and_then(|id| view.task(&id));
+        found.push((format!("task {id}"), task.is_none_or(|task| is_explained(view, board, &now, task, &idle))));
+    }
+    plan.slice.look(robots.len() + tasks.len() * (1 + idle.len()));
+    (view.unexplained.robot, view.unexplained.task) =
+        (robots.into_iter().next_back().unwrap_or_default(), tasks.into_iter().next_back().unwrap_or_default());
+    let is_known = |view: &View, key: &str| match key.split_once(' ') {
+        Some(("task", id)) => view.tasks.contains_key(id),
+        Some((_, id)) => view.authority.contains_key(id),
+        None => false,
+    };
+    let mut since = std::mem::take(&mut view.unexplained.since);
+    since.retain(|key, _| is_known(view, key));
+    for (key, is_explained) in found {
+        if is_explained {
+            since.remove(&key);
+            continue;
+        }
+        let begun = since.entry(key.clone()).or_insert(Some(now.link));
+        if begun.is_some_and(|begun| now.link.since(begun) >= limits::UNEXPLAINED_AFTER) {
+            *begun = None;
+            plan.report.unexplained.push(key);
+        }
+    }
+    view.unexplained.since = since;
+}
+
+/// The next ids of a table behind the last one that was looked at; from the first on where there are none.
+fn next<R>(rows: &BTreeMap<String, R>, last: &str) -> Vec<String> {
+    let behind = (Bound::Excluded(last.to_owned()), Bound::Unbounded);
+    rows.range(behind).take(limits::UNEXPLAINED_LOOKS).map(|(id, _)| id.clone()).collect()
+}
+
+/// A task has a reason, or waits for robots that all have one against it: none that is idle could take it.
+fn is_explained(view: &View, board: &Board, now: &Now, task: &TaskState, idle: &[&RobotId]) -> bool {
+    let Some(intake) = view.intake(&task.task_id) else { return true };
+    match standing::of_task(view, board, now, task, intake) {
+        Some(why) => standing::is_told(&why),
+        None if task.phase != Phase::Queued => false,
+        None => idle.iter().all(|robot_id| filters::pair(view, board, robot_id, task, intake, now).is_err()),
+    }
+}

@@ -1,0 +1,56 @@
+//! Hold tokens of robots: the maker's own stop makes one, and the task of a robot hears when the first comes and the last goes.
+//!
+//! Invariant: a token that stands for a released stop is taken away by a person only.
+
+use crate::fleet::decision::plan::Tx;
+use crate::fleet::projection::rows::{HoldToken, RobotControl};
+use crate::fleet::tasks::transitions::{self, News, happen};
+use crate::ids::RobotId;
+use crate::reason::{Code, Reason};
+use crate::robot::HardwareStop;
+use crate::task::Event;
+
+/// Token while the body's own safety system stops it.
+pub fn stop_token(robot_id: &RobotId) -> String {
+    format!("stop:body:{robot_id}")
+}
+
+/// Token after that, until a person resumes.
+pub fn resume_token(robot_id: &RobotId) -> String {
+    format!("resume:body:{robot_id}")
+}
+
+/// The maker's stop makes a hold token of the robot; its release turns that into one that only a person takes away.
+pub fn hardware_stop(tx: &mut Tx, robot_id: &RobotId, stop: HardwareStop) {
+    let (stopped, resume) = (stop_token(robot_id), resume_token(robot_id));
+    let stands = tx.view.holds.contains_key(&HoldToken::id_of(robot_id, &stopped));
+    let since = tx.now.utc;
+    if stop != HardwareStop::None && !stands {
+        tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &resume), "hold.replaced");
+        tx.put(HoldToken { robot_id: robot_id.clone(), token: stopped, since }, "hold.stopped");
+        touch(tx, robot_id);
+        holds_changed(tx, robot_id);
+    } else if stop == HardwareStop::None && stands {
+        tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &stopped), "hold.released");
+        tx.put(HoldToken { robot_id: robot_id.clone(), token: resume, since }, "hold.awaits_resume");
+    }
+}
+
+/// Every offer writes the robot's control row: one that was planned without the token that has just come is lost.
+pub(in crate::fleet) fn touch(tx: &mut Tx, robot_id: &RobotId) {
+    let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
+    tx.put(known.unwrap_or_else(|| RobotControl::new(robot_id.clone())), "robot.held");
+}
+
+/// Tells the robot's task that a token came or that the last one went.
+pub fn holds_changed(tx: &mut Tx, robot_id: &RobotId) {
+    tx.view.dirty.insert(robot_id.clone());
+    let Some(task_id) = tx.view.held_by(robot_id).and_then(|a| a.subject.task_id().cloned()) else { return };
+    let Some(task) = tx.view.task(&task_id).cloned() else { return };
+    let fleet_stop =
+        tx.view.robot_holds(robot_id).all(|h| h.token != stop_token(robot_id) && h.token != resume_token(robot_id));
+    let why: Reason = if fleet_stop { Code::HoldByStop } else { Code::HoldByBody }.into();
+    let event = if transitions::is_held(tx, &task) { Event::Hold } else { Event::LastHoldGone };
+    let why = (event == Event::Hold).then_some(&why);
+    happen(tx, &task_id, News::of(event, why));
+}

@@ -1,0 +1,291 @@
+//! Keeps what is derived from rows: each row that changes brings the queue, deadlines, holders of places and robots to compose up to date.
+//!
+//! Invariant: what is derived depends on the rows alone, never on the order in which they came.
+
+use super::queue::{TASKS_PER_TURN, Wait};
+use super::rows::{
+    AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter,
+    ServiceClock, SiteRow, Timer,
+};
+use super::state::View;
+use crate::identity::RobotIdentity;
+use crate::ids::{RobotId, TaskId};
+use crate::maintenance::{DrainRelease, DrainRequest};
+use crate::picture::{Picture, Slot, Viewed};
+use crate::policy::AreaPolicy;
+use crate::rows::Writer;
+use crate::stop::record::StopRecord;
+use crate::task::{Attempt, Phase, TaskIntake, TaskState};
+use crate::time::Utc;
+use crate::unknown_rows::UnknownRows;
+use crate::work::{DesiredPolicy, DesiredWork, LaneMark, Session};
+
+impl Picture for View {
+    const WRITER: Writer = Writer::Fleet;
+    fn unknown_rows(&mut self) -> &mut UnknownRows {
+        &mut self.unknown_rows
+    }
+}
+
+macro_rules! viewed {
+    ($($record:ty => $slot:ident;)*) => { $(impl Viewed<View> for $record {
+        fn slot(view: &mut View) -> &mut Slot<Self> { &mut view.$slot }
+    })* };
+}
+
+viewed! {
+    Timer => timers;
+    RobotCounter => counters;
+    SiteRow => sites;
+    DesiredWork => desired_work;
+    DesiredPolicy => desired_policy;
+    ServiceClock => clocks;
+    FleetMark => marks;
+    CommandKey => command_keys;
+    DrainRequest => drain_requests;
+    DrainRelease => drain_releases;
+    AreaBudget => budgets;
+    RobotIdentity => enrolled;
+    LaneMark => lane_marks;
+}
+
+impl Viewed<View> for TaskState {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.tasks
+    }
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+        let Ok(task_id) = TaskId::parse(id) else { return };
+        if let Some(task) = view.tasks.get(id).map(|t| &t.row) {
+            view.dirty.extend(task.robot_id.clone());
+            view.unasked.remove(&task_id);
+            let phase = task.phase;
+            if !phase.is_terminal() {
+                note_open(view, &task_id);
+            } else {
+                let deadline = view.intake(&task_id).and_then(|intake| intake.spec.deadline);
+                if let Some(at) = deadline {
+                    view.deadlines.remove(&(at, task_id.clone()));
+                }
+                note_end(view, &task_id, phase);
+            }
+        }
+        put_in_queue(view, &task_id);
+    }
+}
+
+impl Viewed<View> for TaskIntake {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.intakes
+    }
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        let waits_for = view.intakes.get(id).map(|i| i.row.spec.depends_on.clone()).unwrap_or_default();
+        for task_id in waits_for {
+            let known = view.tasks.get(task_id.as_str()).map(|t| t.row.phase);
+            if let Some(phase) = known.filter(|phase| phase.is_terminal()) {
+                view.ended.insert(task_id.clone(), phase);
+            } else if known.is_none() && !view.ended.contains_key(&task_id) {
+                view.unasked.insert(task_id.clone());
+            }
+            *view.dependants.entry(task_id).or_default() += 1;
+        }
+        old.into_iter().for_each(|old| view.waits_no_more(old));
+        if let Ok(task_id) = TaskId::parse(id) {
+            let deadline = view.intake(&task_id).and_then(|intake| intake.spec.deadline);
+            view.deadlines.extend(deadline.map(|at| (at, task_id.clone())));
+            put_in_queue(view, &task_id);
+        }
+    }
+}
+
+impl Viewed<View> for AreaPolicy {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.policies
+    }
+    /// Whoever put it, this process or another: every robot hears of it.
+    fn changed(view: &mut View, _id: &str, _old: Option<&Self>) {
+        let robots: Vec<RobotId> = view.sessions.values().map(|s| s.row.robot_id.clone()).collect();
+        view.policy_dirty.extend(robots);
+    }
+}
+
+impl Viewed<View> for Incident {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.incidents
+    }
+    /// A person has looked: what was put aside is tried again.
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+        if let Some(closed) = view.incidents.get(id).map(|i| &i.row).filter(|i| i.closed.is_some()) {
+            view.refused.incident_closed(&closed.reason);
+        }
+    }
+}
+
+impl Viewed<View> for StopRecord {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.stops
+    }
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+        view.closed_places.take();
+        view.stops_changed = true;
+        match view.stops.get(id).is_some_and(|record| record.row.is_effective()) {
+            true => view.engaged.insert(id.to_owned()),
+            false => view.engaged.remove(id),
+        };
+    }
+}
+
+impl Viewed<View> for Drain {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.drains
+    }
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        match (view.drains.get(id).map(|d| d.row.robot_id.clone()), old) {
+            (Some(robot_id), _) => {
+                view.drains_of.entry(robot_id).or_default().insert(id.to_owned());
+            }
+            (None, Some(old)) => {
+                if let Some(ids) = view.drains_of.get_mut(&old.robot_id) {
+                    ids.remove(id);
+                }
+            }
+            (None, None) => {}
+        }
+    }
+}
+
+impl Viewed<View> for Attempt {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.attempts
+    }
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+        if let Some(attempt) = view.attempts.get(id) {
+            view.dirty.insert(attempt.row.robot_id.clone());
+        }
+    }
+}
+
+impl Viewed<View> for HoldToken {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.holds
+    }
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        let robot = view.holds.get(id).map(|h| h.row.robot_id.clone()).or_else(|| old.map(|h| h.robot_id.clone()));
+        view.dirty.extend(robot);
+    }
+}
+
+impl Viewed<View> for RobotAuthority {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.authority
+    }
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+        view.dirty.extend(view.authority.get(id).map(|a| a.row.robot_id.clone()));
+    }
+}
+
+impl Viewed<View> for RobotControl {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.control
+    }
+    /// A person's word about its load goes to the robot, whichever process took it.
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        let word = |control: &Self| control.load_settled.clone();
+        let new = view.control.get(id).map(|c| &c.row);
+        if new.and_then(word) != old.and_then(word) {
+            view.dirty.extend(new.map(|control| control.robot_id.clone()));
+        }
+    }
+}
+
+impl Viewed<View> for Session {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.sessions
+    }
+    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+        view.dirty.extend(view.sessions.get(id).map(|s| s.row.robot_id.clone()));
+    }
+}
+
+impl Viewed<View> for Place {
+    fn slot(view: &mut View) -> &mut Slot<Self> {
+        &mut view.places
+    }
+    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+        view.closed_places.take();
+        for robot in old.into_iter().flat_map(|p| &p.holders).map(|h| &h.robot_id) {
+            view.dirty.insert(robot.clone());
+            if let Some(places) = view.held_places.get_mut(robot) {
+                places.remove(id);
+            }
+        }
+        let now: Vec<RobotId> =
+            view.places.get(id).into_iter().flat_map(|p| &p.row.holders).map(|h| h.robot_id.clone()).collect();
+        for robot in now {
+            view.held_places.entry(robot.clone()).or_default().insert(id.to_owned());
+            view.dirty.insert(robot);
+        }
+    }
+}
+
+/// Puts a task where its rows say that it stands: out of the queue, if it waits for no robot.
+pub(in crate::fleet) fn put_in_queue(view: &mut View, task_id: &TaskId) {
+    let rows = view.task(task_id).filter(|task| task.phase == Phase::Queued).zip(view.intake(task_id));
+    let wait = rows.map(|(task, intake)| {
+        let wait = match Wait::of(task, intake, &view.ended, view.queue.now) {
+            Wait::Turn(rank) if view.bugs.nobody_is_promoted() => Wait::Turn(rank.unpromoted(intake.spec.priority)),
+            wait => wait,
+        };
+        (wait, task.queued_since)
+    });
+    view.queue.put(task_id, wait);
+}
+
+/// A task has ended: those that depend on it, if there are any, wait for the next thing, or for nothing more.
+pub(in crate::fleet) fn note_end(view: &mut View, task_id: &TaskId, phase: Phase) {
+    if !view.dependants.contains_key(task_id) {
+        return;
+    }
+    view.ended.insert(task_id.clone(), phase);
+    for dependent in view.queue.dependents.get(task_id).cloned().unwrap_or_default() {
+        put_in_queue(view, &dependent);
+    }
+}
+
+/// A task that was taken for ended goes on: those that depend on it wait for it again.
+pub(in crate::fleet) fn note_open(view: &mut View, task_id: &TaskId) {
+    if view.ended.remove(task_id).is_none() {
+        return;
+    }
+    let intakes = view.intakes.values().map(|intake| &intake.row);
+    let dependents: Vec<TaskId> =
+        intakes.filter(|intake| intake.spec.depends_on.contains(task_id)).map(|i| i.task_id.clone()).collect();
+    for dependent in dependents {
+        put_in_queue(view, &dependent);
+    }
+}
+
+/// Time has passed: whose time has come is ready, and who waited for long is promoted.
+pub(in crate::fleet) fn advance(view: &mut View, now: Utc) {
+    view.queue.now = now;
+    let due = [&view.queue.due, &view.queue.checks]
+        .into_iter()
+        .flat_map(|tasks| tasks.iter().take_while(|(at, _)| *at <= now).take(TASKS_PER_TURN));
+    for task_id in due.map(|(_, id)| id.clone()).collect::<Vec<_>>() {
+        put_in_queue(view, &task_id);
+    }
+}
+
+impl View {
+    /// A task is over, or gone: nothing is asked any more of those that it waited for alone.
+    pub(super) fn waits_no_more(&mut self, intake: &TaskIntake) {
+        for task_id in &intake.spec.depends_on {
+            let Some(left) = self.dependants.get_mut(task_id) else { continue };
+            *left -= 1;
+            if *left == 0 {
+                self.dependants.remove(task_id);
+                self.ended.remove(task_id);
+                self.unasked.remove(task_id);
+            }
+        }
+    }
+}

@@ -1,0 +1,112 @@
+//! Moves errands by what their robots report: accepted, broken off, not heard, over.
+//!
+//! Invariant: an errand's end has no consequence but a free robot. Errands are given in `assignment::errands`.
+
+use super::attempts;
+use super::transitions::{disarm, end_attempt};
+use crate::fleet::decision::plan::Tx;
+use crate::fleet::projection::rows::{Timer, TimerKind};
+use crate::fleet::projection::state::View;
+use crate::ids::RobotId;
+use crate::limits;
+use crate::reason::Reason;
+use crate::task::state::{Errand, Uncertain};
+use crate::task::{Attempt, AttemptPhase};
+use crate::work::{AttemptReport, WorkState};
+
+/// Errands that are on their way to a stop.
+pub fn stopping(view: &View) -> usize {
+    view.attempts.values().filter(|a| a.row.errand.is_some() && a.row.phase == AttemptPhase::Stopping).count()
+}
+
+/// Takes the robot's report of its errand.
+pub fn report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
+    if tx.view.held_by(robot_id) != Some(&report.attempt) {
+        return;
+    }
+    let Some(mut a) = tx.view.attempt(&report.attempt).cloned() else { return };
+    attempts::note_step(&mut a, report.step_index);
+    a.stats = report.stats;
+    a.fault = report.fault.clone().or(a.fault);
+    a.refusal = report.refusal.clone().or(a.refusal);
+    if a.accepted.is_none() && report.state != WorkState::Refused {
+        a.accepted = Some(tx.now.utc);
+        disarm(tx, TimerKind::OfferAck, &a.attempt);
+    }
+    if a.uncertain.take().is_some() {
+        disarm(tx, TimerKind::Uncertain, &a.attempt);
+    }
+    let live = match report.state {
+        WorkState::Accepted => AttemptPhase::Accepted,
+        WorkState::Navigating => AttemptPhase::Navigating,
+        WorkState::Executing => AttemptPhase::Executing,
+        WorkState::Paused | WorkState::Stopping | WorkState::StepUnknown | WorkState::Unknown(_) => {
+            AttemptPhase::Paused
+        }
+        // Refused after it was accepted: the robot has lost its memory of it.
+        WorkState::Refused if a.accepted.is_some() => AttemptPhase::Aborted,
+        WorkState::Refused => AttemptPhase::Refused,
+        WorkState::Succeeded => AttemptPhase::Succeeded,
+        WorkState::Failed => AttemptPhase::Failed,
+        WorkState::Aborted if a.phase == AttemptPhase::Stopping && is_docked(&a) => AttemptPhase::Docked,
+        WorkState::Aborted | WorkState::Suspended => AttemptPhase::Aborted,
+    };
+    if live.is_terminal() {
+        // One that is over as soon as it is given would be given without end.
+        let is_brief = tx.now.ms_since(a.offered) < limits::ERRAND_PAUSE.as_ms();
+        if (live != AttemptPhase::Succeeded || is_brief) && a.phase != AttemptPhase::Stopping {
+            let until = tx.now.link + limits::ERRAND_PAUSE;
+            tx.view.unwilling.insert(robot_id.clone(), until);
+        }
+        a.phase = live;
+        end_attempt(tx, &mut a);
+    } else if a.phase.transitions().contains(&live) {
+        a.phase = live;
+    }
+    tx.put(a, "errand.changed");
+}
+
+/// The robot has come to the charger that it was sent to.
+pub(in crate::fleet) fn is_docked(a: &Attempt) -> bool {
+    a.errand == Some(Errand::Charge) && a.step_index >= attempts::AT_GOAL
+}
+
+/// Asks the robot to break its errand off.
+pub fn stop(tx: &mut Tx, robot_id: &RobotId) {
+    let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
+    if a.errand.is_none() || a.phase.is_terminal() || a.phase == AttemptPhase::Stopping {
+        return;
+    }
+    a.phase = AttemptPhase::Stopping;
+    disarm(tx, TimerKind::OfferAck, &a.attempt);
+    tx.put(a, "errand.stopping");
+}
+
+/// A timer of an errand fired: an unanswered offer is taken back; everything else waits for the robot's report.
+pub fn fire(tx: &mut Tx, timer: &Timer) {
+    disarm(tx, timer.kind, &timer.attempt);
+    if timer.kind == TimerKind::OfferAck
+        && let Some(robot_id) = tx.view.attempt(&timer.attempt).map(|a| a.robot_id.clone())
+    {
+        stop(tx, &robot_id);
+    }
+}
+
+/// The robot was not heard for longer than its authority.
+pub fn lease_over(tx: &mut Tx, robot_id: &RobotId, cause: Reason) {
+    let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
+    a.uncertain = Some(Uncertain { since: tx.now.utc, cause });
+    tx.put(a, "errand.uncertain");
+}
+
+/// The robot is heard again and still lists its errand.
+pub fn seen(tx: &mut Tx, robot_id: &RobotId) {
+    let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
+    a.uncertain = None;
+    if a.accepted.is_none() {
+        a.accepted = Some(tx.now.utc);
+        a.phase = AttemptPhase::Accepted;
+        disarm(tx, TimerKind::OfferAck, &a.attempt);
+    }
+    tx.put(a, "errand.seen");
+}
