@@ -4,7 +4,7 @@ use super::asked::Command;
 use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, RolloutId, SiteId, StopId, TaskId};
 use crate::reason::Reason;
 use crate::robot::{Duty, Inventory};
-use crate::rows::{Index, Record, Seq, Table};
+use crate::rows::{Index, Record, Seq, Table, body_is_json};
 use crate::time::Utc;
 use crate::work::WorkStats;
 use serde::{Deserialize, Serialize};
@@ -65,6 +65,7 @@ impl Place {
 
 impl Record for Place {
     const TABLE: Table = Table::PlaceGrant;
+    body_is_json!();
     fn id(&self) -> String {
         self.place_id.to_string()
     }
@@ -94,6 +95,7 @@ pub struct RobotAuthority {
 
 impl Record for RobotAuthority {
     const TABLE: Table = Table::RobotAuthority;
+    body_is_json!();
     fn id(&self) -> String {
         self.robot_id.to_string()
     }
@@ -207,6 +209,7 @@ impl RobotControl {
 
 impl Record for RobotControl {
     const TABLE: Table = Table::RobotControl;
+    body_is_json!();
     fn id(&self) -> String {
         self.robot_id.to_string()
     }
@@ -270,6 +273,7 @@ impl Timer {
 
 impl Record for Timer {
     const TABLE: Table = Table::Timer;
+    body_is_json!();
     fn id(&self) -> String {
         Self::id_of(self.kind, &self.attempt)
     }
@@ -299,6 +303,7 @@ impl HoldToken {
 
 impl Record for HoldToken {
     const TABLE: Table = Table::HoldToken;
+    body_is_json!();
     fn id(&self) -> String {
         Self::id_of(&self.robot_id, &self.token)
     }
@@ -332,6 +337,7 @@ pub struct RobotCounter {
 
 impl Record for RobotCounter {
     const TABLE: Table = Table::RobotCounter;
+    body_is_json!();
     fn id(&self) -> String {
         format!("{}@{}", self.robot_id, self.software)
     }
@@ -353,6 +359,7 @@ pub struct SiteRow {
 
 impl Record for SiteRow {
     const TABLE: Table = Table::Site;
+    body_is_json!();
     fn id(&self) -> String {
         self.site_id.to_string()
     }
@@ -369,6 +376,7 @@ pub struct ServiceClock {
 
 impl Record for ServiceClock {
     const TABLE: Table = Table::ServiceClock;
+    body_is_json!();
     fn id(&self) -> String {
         "fleet".to_owned()
     }
@@ -383,6 +391,7 @@ pub struct FleetMark {
 
 impl Record for FleetMark {
     const TABLE: Table = Table::FleetMark;
+    body_is_json!();
     fn id(&self) -> String {
         "fleet".to_owned()
     }
@@ -421,6 +430,7 @@ pub struct Closed {
 
 impl Record for Incident {
     const TABLE: Table = Table::Incident;
+    body_is_json!();
     fn id(&self) -> String {
         self.id.clone()
     }
@@ -501,6 +511,7 @@ pub struct AreaBudget {
 
 impl Record for AreaBudget {
     const TABLE: Table = Table::AreaBudget;
+    body_is_json!();
     fn id(&self) -> String {
         self.area_id.to_string()
     }
@@ -508,6 +519,7 @@ impl Record for AreaBudget {
 
 impl Record for Drain {
     const TABLE: Table = Table::Drain;
+    body_is_json!();
     fn id(&self) -> String {
         self.drain_id.to_string()
     }
