@@ -5,7 +5,7 @@
 //! lead all the same write nothing twice: every item expects revisions. The lease saves them from planning in vain.
 
 use crate::limits;
-use crate::rows::{BadRow, Entry, Expect, Item, Key, Record, Revision, Row, Table};
+use crate::rows::{BadRow, Entry, Expect, Item, Key, Record, Revision, Row, Table, body_is_json};
 use crate::time::LinkTime;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
@@ -34,6 +34,7 @@ macro_rules! leader_rows {
 
         impl Record for $row {
             const TABLE: Table = Table::$table;
+            body_is_json!();
             fn id(&self) -> String {
                 $id.to_owned()
             }

@@ -33,3 +33,8 @@ pub mod unknown_rows;
 pub mod update;
 pub mod wall;
 pub mod work;
+
+use std::pin::Pin;
+
+/// What a door of a service answers with that goes on for long: its code is compiled where it is written, not where it is awaited.
+pub type Boxed<'a, T> = Pin<Box<dyn Future<Output = T> + Send + 'a>>;

@@ -4,7 +4,7 @@
 //! request that stands without a release, and a release says why nothing that was permitted can still happen.
 
 use crate::ids::{DrainId, RobotId, RolloutId};
-use crate::rows::{Index, Record, Table};
+use crate::rows::{Index, Record, Table, body_is_json};
 use serde::{Deserialize, Serialize};
 
 /// Kind of the fact that a person should look into something; its body is the reason. Fleet opens an incident for it.
@@ -38,6 +38,7 @@ pub struct DrainRequest {
 
 impl Record for DrainRequest {
     const TABLE: Table = Table::DrainRequest;
+    body_is_json!();
     fn id(&self) -> String {
         self.drain_id.to_string()
     }
@@ -71,6 +72,7 @@ pub enum ReleasedBy {
 
 impl Record for DrainRelease {
     const TABLE: Table = Table::DrainRelease;
+    body_is_json!();
     fn id(&self) -> String {
         self.drain_id.to_string()
     }

@@ -6,7 +6,7 @@
 use crate::picture::{Picture, Slot, Tx, Viewed};
 use crate::privacy;
 use crate::reason::{Code, Kind, Reason, Refusal};
-use crate::rows::{Index, Record, Revision, Table};
+use crate::rows::{Index, Record, Revision, Table, body_is_json};
 use crate::time::Utc;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -36,6 +36,7 @@ pub struct CommandKey<C> {
 
 impl<C: Asked> Record for CommandKey<C> {
     const TABLE: Table = C::KEYS;
+    body_is_json!();
     fn id(&self) -> String {
         self.id.clone()
     }

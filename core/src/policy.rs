@@ -3,7 +3,7 @@
 use crate::ids::AreaId;
 use crate::limits;
 use crate::reason::Violations;
-use crate::rows::{Record, Table};
+use crate::rows::{Record, Table, body_is_json};
 use crate::time::{Now, Utc};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
@@ -203,6 +203,7 @@ impl AreaPolicy {
 
 impl Record for AreaPolicy {
     const TABLE: Table = Table::AreaPolicy;
+    body_is_json!();
     fn id(&self) -> String {
         self.area_id.to_string()
     }

@@ -265,6 +265,29 @@ pub struct Index {
     pub order: Option<i64>,
 }
 
+/// The two ways of the body of a record, within its `impl`: serde's code for it is compiled here, once, and not where it is read and written.
+macro_rules! body_is_json {
+    () => {
+        fn body(&self) -> std::sync::Arc<str> {
+            $crate::rows::written(self)
+        }
+        fn of_row(row: &$crate::rows::Row) -> Result<Self, $crate::rows::BadRow> {
+            $crate::rows::read(row)
+        }
+    };
+}
+pub(crate) use body_is_json;
+
+/// Plain data as JSON.
+pub(crate) fn written(data: &impl Serialize) -> Arc<str> {
+    // Plain data serde_json cannot fail to write.
+    serde_json::to_string(data).map_or_else(|e| unreachable!("plain data is not JSON: {e}"), Arc::from)
+}
+
+pub(crate) fn read<R: Record>(row: &Row) -> Result<R, BadRow> {
+    serde_json::from_str(&row.body).map_err(|source| BadRow { key: row.key.clone(), source: Arc::new(source) })
+}
+
 /// A core type that is a row of control.db. The body is JSON.
 pub trait Record: Serialize + DeserializeOwned + Clone + Send + Sync + 'static {
     /// Where it is kept.
@@ -280,10 +303,9 @@ pub trait Record: Serialize + DeserializeOwned + Clone + Send + Sync + 'static {
         Key::new(Self::TABLE, self.id())
     }
     /// The row body.
-    fn body(&self) -> Arc<str> {
-        // A record holds only plain data, which serde_json cannot fail to write.
-        serde_json::to_string(self).map_or_else(|e| unreachable!("record is not JSON: {e}"), Arc::from)
-    }
+    fn body(&self) -> Arc<str>;
+    /// Reads it back; an error names the row.
+    fn of_row(row: &Row) -> Result<Self, BadRow>;
 }
 
 /// One stored row.
@@ -302,7 +324,7 @@ pub struct Row {
 impl Row {
     /// Reads the body; an error names the row.
     pub fn decode<R: Record>(&self) -> Result<R, BadRow> {
-        serde_json::from_str(&self.body).map_err(|source| BadRow { key: self.key.clone(), source: Arc::new(source) })
+        R::of_row(self)
     }
 }
 

@@ -8,7 +8,7 @@ use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, StopId, WaypointI
 use crate::reason::Reason;
 pub use crate::robot::WorkState;
 use crate::robot::{Fault, HardwareStop, HeldPlace, Lane, Load, Mode, Presence, StopLevel, Vitals};
-use crate::rows::{Index, Record, Table};
+use crate::rows::{Index, Record, Table, body_is_json, written};
 use crate::update::UpdateEvent;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -52,6 +52,7 @@ pub struct LoadWord {
 
 impl Record for DesiredWork {
     const TABLE: Table = Table::DesiredWork;
+    body_is_json!();
     fn id(&self) -> String {
         self.robot_id.to_string()
     }
@@ -196,6 +197,7 @@ pub struct DesiredPolicy {
 
 impl Record for DesiredPolicy {
     const TABLE: Table = Table::DesiredPolicy;
+    body_is_json!();
     fn id(&self) -> String {
         self.robot_id.to_string()
     }
@@ -366,6 +368,20 @@ pub struct InboxEntry {
     pub stamp_in_future: bool,
 }
 
+impl InboxEntry {
+    /// As text, for [`InboxEntry::parse`].
+    pub fn text(&self) -> Arc<str> {
+        written(self)
+    }
+    /// From [`InboxEntry::text`].
+    ///
+    /// # Errors
+    /// If it is not such a text.
+    pub fn parse(text: &str) -> Result<Self, serde_json::Error> {
+        serde_json::from_str(text)
+    }
+}
+
 /// A sample, a gap, or a sample nobody could read.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -463,6 +479,7 @@ fn followed(said: u64) -> u64 {
 
 impl Record for Session {
     const TABLE: Table = Table::Session;
+    body_is_json!();
     fn id(&self) -> String {
         self.robot_id.to_string()
     }
@@ -545,6 +562,7 @@ impl PresenceRow {
 
 impl Record for PresenceRow {
     const TABLE: Table = Table::Presence;
+    body_is_json!();
     fn id(&self) -> String {
         self.robot_id.to_string()
     }
@@ -575,6 +593,7 @@ impl LaneMark {
 
 impl Record for LaneMark {
     const TABLE: Table = Table::LaneMark;
+    body_is_json!();
     fn id(&self) -> String {
         format!("{}/{}", self.robot_id, self.ring)
     }
@@ -623,8 +642,7 @@ pub struct Told {
 impl Told {
     /// As text, for [`Told::parse`].
     pub fn text(&self) -> Arc<str> {
-        // A heartbeat holds only plain data, which serde_json cannot fail to write.
-        serde_json::to_string(self).map_or_else(|e| unreachable!("a heartbeat is not JSON: {e}"), Arc::from)
+        written(self)
     }
     /// From [`Told::text`].
     ///

@@ -6,6 +6,7 @@
 use crate::device::DeviceKey;
 use crate::dial::{self, Dial, TcpDial};
 use crate::tls;
+use midshift_core::Boxed;
 use midshift_core::identity::{Digest, Secret};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
@@ -202,28 +203,30 @@ fn request(key: &DeviceKey) -> Result<String, Error> {
 ///
 /// # Errors
 /// The server is none of the invitation's site, or says no.
-pub async fn enrol(
-    address: &str,
-    robot_id: &RobotId,
-    invitation: &Invitation,
-    key: &DeviceKey,
-) -> Result<Enrolled, Error> {
-    let authority_pem = tls::authority_of(address, invitation.pin).await?;
-    let believes = tls::Tls::fixed(tls::config(&authority_pem, None)?);
-    let channel = TcpDial::new(&format!("https://{address}"), None)?.with_tls(believes).dial().await?;
-    let asked = EnrolRequest {
-        robot_id: robot_id.to_string(),
-        secret: invitation.secret.reveal(Secret::ENROLMENT),
-        request_pem: request(key)?,
-    };
-    let answer = EnrolmentServiceClient::new(channel).enrol(asked).await?.into_inner();
-    Ok(Enrolled {
-        robot_id: robot_id.clone(),
-        certificate_pem: answer.certificate_pem,
-        authority_pem,
-        expires_unix_ms: answer.expire_time.map_or(0, |time| time_of(&time).0),
-        trust_json: answer.trust_json,
-        line_id: invitation.secret.id().to_string(),
+pub fn enrol<'a>(
+    address: &'a str,
+    robot_id: &'a RobotId,
+    invitation: &'a Invitation,
+    key: &'a DeviceKey,
+) -> Boxed<'a, Result<Enrolled, Error>> {
+    Box::pin(async move {
+        let authority_pem = tls::authority_of(address, invitation.pin).await?;
+        let believes = tls::Tls::fixed(tls::config(&authority_pem, None)?);
+        let channel = TcpDial::new(&format!("https://{address}"), None)?.with_tls(believes).dial().await?;
+        let asked = EnrolRequest {
+            robot_id: robot_id.to_string(),
+            secret: invitation.secret.reveal(Secret::ENROLMENT),
+            request_pem: request(key)?,
+        };
+        let answer = EnrolmentServiceClient::new(channel).enrol(asked).await?.into_inner();
+        Ok(Enrolled {
+            robot_id: robot_id.clone(),
+            certificate_pem: answer.certificate_pem,
+            authority_pem,
+            expires_unix_ms: answer.expire_time.map_or(0, |time| time_of(&time).0),
+            trust_json: answer.trust_json,
+            line_id: invitation.secret.id().to_string(),
+        })
     })
 }
 
@@ -249,34 +252,36 @@ impl Identity {
     ///
     /// # Errors
     /// It is neither enrolled nor invited, or is another robot.
-    pub async fn open(
-        folder: &Path,
-        robot_id: &RobotId,
+    pub fn open<'a>(
+        folder: &'a Path,
+        robot_id: &'a RobotId,
         key: DeviceKey,
-        address: &str,
-        invitation: Option<&Invitation>,
-    ) -> Result<Self, Error> {
-        let enrolled = match (Enrolled::read(folder)?, invitation) {
-            (Some(known), _) if known.robot_id != *robot_id => {
-                return Err(Error::OtherRobot { known: known.robot_id, asked: robot_id.clone() });
-            }
-            (Some(known), None) => known,
-            // A line that was used already stays in a unit file: what it gave is there.
-            (Some(known), Some(invited)) if known.is_from(invited)? => known,
-            (known, Some(invited)) => match (enrol(address, robot_id, invited, &key).await, known) {
-                (Ok(enrolled), _) => {
-                    enrolled.write(folder)?;
-                    enrolled
+        address: &'a str,
+        invitation: Option<&'a Invitation>,
+    ) -> Boxed<'a, Result<Self, Error>> {
+        Box::pin(async move {
+            let enrolled = match (Enrolled::read(folder)?, invitation) {
+                (Some(known), _) if known.robot_id != *robot_id => {
+                    return Err(Error::OtherRobot { known: known.robot_id, asked: robot_id.clone() });
                 }
-                (Err(error), Some(known)) if tls::pin_of(&known.authority_pem)? == invited.pin => {
-                    tracing::warn!(%robot_id, %error, "not enrolled anew: it goes on with the certificate that it has");
-                    known
-                }
-                (Err(error), _) => return Err(error),
-            },
-            (None, None) => return Err(Error::NotEnrolled(robot_id.clone())),
-        };
-        Self::new(enrolled, key, Some(folder.to_owned()))
+                (Some(known), None) => known,
+                // A line that was used already stays in a unit file: what it gave is there.
+                (Some(known), Some(invited)) if known.is_from(invited)? => known,
+                (known, Some(invited)) => match (enrol(address, robot_id, invited, &key).await, known) {
+                    (Ok(enrolled), _) => {
+                        enrolled.write(folder)?;
+                        enrolled
+                    }
+                    (Err(error), Some(known)) if tls::pin_of(&known.authority_pem)? == invited.pin => {
+                        tracing::warn!(%robot_id, %error, "not enrolled anew: it goes on with the certificate that it has");
+                        known
+                    }
+                    (Err(error), _) => return Err(error),
+                },
+                (None, None) => return Err(Error::NotEnrolled(robot_id.clone())),
+            };
+            Self::new(enrolled, key, Some(folder.to_owned()))
+        })
     }
 
     /// What the machine was given.
@@ -290,21 +295,23 @@ impl Identity {
     }
 
     /// Renews the certificate in its time, over ways of its own, until it is dropped.
-    pub async fn keep(mut self, dial: Arc<dyn Dial>, clock: Arc<dyn Clock>) {
-        loop {
-            let pause = if self.enrolled.is_due(clock.now().wall) {
-                match self.renew(&*dial).await {
-                    Ok(()) => LOOK,
-                    Err(error) => {
-                        tracing::warn!(%error, "the certificate was not renewed");
-                        AGAIN
+    pub fn keep(mut self, dial: Arc<dyn Dial>, clock: Arc<dyn Clock>) -> Boxed<'static, ()> {
+        Box::pin(async move {
+            loop {
+                let pause = if self.enrolled.is_due(clock.now().wall) {
+                    match self.renew(&*dial).await {
+                        Ok(()) => LOOK,
+                        Err(error) => {
+                            tracing::warn!(%error, "the certificate was not renewed");
+                            AGAIN
+                        }
                     }
-                }
-            } else {
-                LOOK
-            };
-            tokio::time::sleep(pause).await;
-        }
+                } else {
+                    LOOK
+                };
+                tokio::time::sleep(pause).await;
+            }
+        })
     }
 
     async fn renew(&mut self, dial: &dyn Dial) -> Result<(), Error> {

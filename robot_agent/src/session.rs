@@ -20,6 +20,7 @@ use crate::store::{self, Op, Store};
 use crate::update::io::Worker;
 use crate::update::{Done, Job, UpdateConfig};
 use backon::{BackoffBuilder, ExponentialBackoff, ExponentialBuilder};
+use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
@@ -33,7 +34,7 @@ use midshift_proto::session::{
     Welcome,
 };
 use rand::{RngExt, SeedableRng};
-use std::future::{Future, pending};
+use std::future::pending;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -101,7 +102,6 @@ const SOON_MS: std::ops::Range<u64> = 50..1_000;
 /// The way the session takes.
 const PATH: &str = "/midshift.link.v1.LinkService/Session";
 
-type Boxed<T> = Pin<Box<dyn Future<Output = T> + Send>>;
 /// The store comes back from each commit.
 type Commit = (Box<dyn Store>, Result<(), store::Error>);
 /// What came of old STATUS, with the session that it was for.
@@ -125,9 +125,9 @@ enum Way {
     /// Not yet.
     Waiting(Pin<Box<tokio::time::Sleep>>),
     /// A connection is being made.
-    Dialing(Boxed<Result<Channel, String>>),
+    Dialing(Boxed<'static, Result<Channel, String>>),
     /// Hello was said.
-    Greeting(Boxed<Greeted>),
+    Greeting(Boxed<'static, Greeted>),
 }
 
 enum Greeted {
@@ -171,70 +171,72 @@ pub struct Agent {
     rng: rand::rngs::StdRng,
     store: Option<Box<dyn Store>>,
     batch: u64,
-    committing: Option<Boxed<Commit>>,
+    committing: Option<Boxed<'static, Commit>>,
     worker: Option<Box<dyn Worker>>,
-    working: Option<Boxed<Worked>>,
+    working: Option<Boxed<'static, Worked>>,
     /// Ends with the session that it is for.
-    replaying: Option<Boxed<Replaying>>,
+    replaying: Option<Boxed<'static, Replaying>>,
     leave: CancellationToken,
     pulsed: LinkTime,
     exit: Option<ExitReason>,
 }
 
 /// Runs one agent until `shutdown`, or until the agent ends by itself.
-pub async fn run(
+pub fn run(
     mut config: AgentConfig,
     body: Box<dyn Body>,
     mut store: Box<dyn Store>,
     clock: Arc<dyn Clock>,
     lines: Lines,
     shutdown: CancellationToken,
-) -> Result<ExitReason, Error> {
-    let mut kept = store.load(&config.new_ring_id).await?;
-    if kept.ledger.device.is_none() {
-        let made = Op::Device(DeviceKey::draw());
-        store.commit(std::slice::from_ref(&made)).await?;
-        kept.apply(&made);
-    }
-    let holdings = look(config.update.as_mut()).await;
-    let core = CoreConfig {
-        robot_id: config.robot_id.clone(),
-        bugs: config.bugs,
-        update: config.update.as_ref().map(|u| u.config.clone()),
-        server_is_proven: lines.link.proves_server(),
-    };
-    let mut core = AgentCore::new(core, body, kept, clock.now());
-    core.saw(holdings);
-    let mut stop = None;
-    if let Some(line) = config.stop.take() {
-        let now = clock.now();
-        let (line, loaded) = Line::begin(line, unreadable(&config.robot_id, now.wall), config.seed).await;
-        core.obeys_stops(loaded, now.link);
-        stop = Some(line);
-    }
-    let agent = Agent {
-        retry: retries(config.seed),
-        patience: SILENCE,
-        refused: Repeats::default(),
-        rng: rand::rngs::StdRng::seed_from_u64(config.seed),
-        core,
-        clock,
-        lines,
-        stop,
-        open: None,
-        way: Way::Idle,
-        store: Some(store),
-        batch: 0,
-        committing: None,
-        worker: config.update.take().map(|update| update.worker),
-        working: None,
-        replaying: None,
-        leave: CancellationToken::new(),
-        pulsed: LinkTime(0),
-        exit: None,
-        config,
-    };
-    agent.run(shutdown).await
+) -> Boxed<'static, Result<ExitReason, Error>> {
+    Box::pin(async move {
+        let mut kept = store.load(&config.new_ring_id).await?;
+        if kept.ledger.device.is_none() {
+            let made = Op::Device(DeviceKey::draw());
+            store.commit(std::slice::from_ref(&made)).await?;
+            kept.apply(&made);
+        }
+        let holdings = look(config.update.as_mut()).await;
+        let core = CoreConfig {
+            robot_id: config.robot_id.clone(),
+            bugs: config.bugs,
+            update: config.update.as_ref().map(|u| u.config.clone()),
+            server_is_proven: lines.link.proves_server(),
+        };
+        let mut core = AgentCore::new(core, body, kept, clock.now());
+        core.saw(holdings);
+        let mut stop = None;
+        if let Some(line) = config.stop.take() {
+            let now = clock.now();
+            let (line, loaded) = Line::begin(line, unreadable(&config.robot_id, now.wall), config.seed).await;
+            core.obeys_stops(loaded, now.link);
+            stop = Some(line);
+        }
+        let agent = Agent {
+            retry: retries(config.seed),
+            patience: SILENCE,
+            refused: Repeats::default(),
+            rng: rand::rngs::StdRng::seed_from_u64(config.seed),
+            core,
+            clock,
+            lines,
+            stop,
+            open: None,
+            way: Way::Idle,
+            store: Some(store),
+            batch: 0,
+            committing: None,
+            worker: config.update.take().map(|update| update.worker),
+            working: None,
+            replaying: None,
+            leave: CancellationToken::new(),
+            pulsed: LinkTime(0),
+            exit: None,
+            config,
+        };
+        agent.run(shutdown).await
+    })
 }
 
 /// What is on the disk, for the first Hello: the core looks for itself, and that may come after it.
@@ -601,7 +603,7 @@ async fn greet(channel: Channel, hello: v1::SessionRequest, clock: Arc<dyn Clock
     }
 }
 
-async fn ready<T>(future: &mut Option<Boxed<T>>) -> T {
+async fn ready<T>(future: &mut Option<Boxed<'static, T>>) -> T {
     match future {
         Some(future) => future.await,
         None => pending().await,

@@ -9,6 +9,7 @@ use crate::ledger::SubjectRow;
 use crate::ring::LaneKept;
 use crate::store::{Error, Kept, Op, Store};
 use async_trait::async_trait;
+use midshift_core::Boxed;
 use midshift_core::ids::Subject;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{Lane, ReportedAttempt};
@@ -51,30 +52,34 @@ pub struct SqliteStore {
 
 impl SqliteStore {
     /// Opens or makes the file, which only its owner may read: it holds secrets. Its folder must exist.
-    pub async fn open(path: &Path) -> Result<Self, Error> {
-        let lock = lock(path)?;
-        keep_private(path).map_err(io_error(format!("keeping {} private", path.display())))?;
-        let mut connection = SqliteConnectOptions::new()
-            .filename(path)
-            .create_if_missing(true)
-            .journal_mode(SqliteJournalMode::Wal)
-            .synchronous(SqliteSynchronous::Full)
-            .busy_timeout(BUSY)
-            .disable_statement_logging()
-            .connect()
-            .await?;
-        let mode = "SELECT journal_mode || ' ' || synchronous FROM pragma_journal_mode, pragma_synchronous";
-        let found: String = sqlx::query(mode).fetch_one(&mut connection).await?.try_get(0)?;
-        if found != "wal 2" {
-            return Err(Error::WrongMode(format!("journal_mode and synchronous are {found}, not wal 2")));
-        }
-        let version: i64 =
-            sqlx::query("SELECT user_version FROM pragma_user_version").fetch_one(&mut connection).await?.try_get(0)?;
-        if version > VERSION {
-            return Err(Error::WrongMode(format!("the file has version {version}, this agent knows {VERSION}")));
-        }
-        sqlx::raw_sql(TABLES).execute(&mut connection).await?;
-        Ok(Self { connection, _lock: lock })
+    pub fn open(path: &Path) -> Boxed<'_, Result<Self, Error>> {
+        Box::pin(async move {
+            let lock = lock(path)?;
+            keep_private(path).map_err(io_error(format!("keeping {} private", path.display())))?;
+            let mut connection = SqliteConnectOptions::new()
+                .filename(path)
+                .create_if_missing(true)
+                .journal_mode(SqliteJournalMode::Wal)
+                .synchronous(SqliteSynchronous::Full)
+                .busy_timeout(BUSY)
+                .disable_statement_logging()
+                .connect()
+                .await?;
+            let mode = "SELECT journal_mode || ' ' || synchronous FROM pragma_journal_mode, pragma_synchronous";
+            let found: String = sqlx::query(mode).fetch_one(&mut connection).await?.try_get(0)?;
+            if found != "wal 2" {
+                return Err(Error::WrongMode(format!("journal_mode and synchronous are {found}, not wal 2")));
+            }
+            let version: i64 = sqlx::query("SELECT user_version FROM pragma_user_version")
+                .fetch_one(&mut connection)
+                .await?
+                .try_get(0)?;
+            if version > VERSION {
+                return Err(Error::WrongMode(format!("the file has version {version}, this agent knows {VERSION}")));
+            }
+            sqlx::raw_sql(TABLES).execute(&mut connection).await?;
+            Ok(Self { connection, _lock: lock })
+        })
     }
 
     async fn facts(&mut self, kept: &mut Kept) -> Result<(), Error> {

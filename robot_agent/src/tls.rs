@@ -3,6 +3,7 @@
 //! Invariant: version 1.3 with the site's own root and no other: no certificate of the public web lets a server speak to a robot. Every server of a site answers to
 //! one name, so an address may change without a new certificate. Called by the agent, the CLI and the tests.
 
+use midshift_core::Boxed;
 use midshift_core::identity::Digest;
 use rustls::client::WebPkiServerVerifier;
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
@@ -127,28 +128,30 @@ fn certificates(pem: &str, what: &'static str) -> Result<Vec<CertificateDer<'sta
 ///
 /// # Errors
 /// Nobody is there, or it shows another root, or its own certificate is not of it.
-pub async fn authority_of(address: &str, pin: Digest) -> Result<String, Error> {
-    let shown = async {
-        let stream = TcpStream::connect(address).await?;
-        let provider = Arc::new(aws_lc_rs::default_provider());
-        let config = ClientConfig::builder_with_provider(provider.clone())
-            .with_protocol_versions(&[&TLS13])
-            .map_err(io::Error::other)?
-            .dangerous()
-            .with_custom_certificate_verifier(Arc::new(Pinned { pin, provider }))
-            .with_no_client_auth();
-        let stream = connect(Arc::new(h2(config)), stream).await?;
-        let chain = stream.get_ref().1.peer_certificates().unwrap_or_default();
-        let root = chain.iter().find(|shown| digest_of(shown) == Some(pin)).cloned();
-        root.ok_or_else(|| io::Error::other("the root is gone"))
-    };
-    let late = |_| Error::NotShown(io::ErrorKind::TimedOut.into());
-    let not_shown = |error: io::Error| match is_other_root(&error) {
-        true => Error::OtherRoot { address: address.to_owned() },
-        false => Error::NotShown(error),
-    };
-    let root = timeout(SHOWN_WITHIN, shown).await.map_err(late)?.map_err(not_shown)?;
-    Ok(pem("CERTIFICATE", &root))
+pub fn authority_of(address: &str, pin: Digest) -> Boxed<'_, Result<String, Error>> {
+    Box::pin(async move {
+        let shown = async {
+            let stream = TcpStream::connect(address).await?;
+            let provider = Arc::new(aws_lc_rs::default_provider());
+            let config = ClientConfig::builder_with_provider(provider.clone())
+                .with_protocol_versions(&[&TLS13])
+                .map_err(io::Error::other)?
+                .dangerous()
+                .with_custom_certificate_verifier(Arc::new(Pinned { pin, provider }))
+                .with_no_client_auth();
+            let stream = connect(Arc::new(h2(config)), stream).await?;
+            let chain = stream.get_ref().1.peer_certificates().unwrap_or_default();
+            let root = chain.iter().find(|shown| digest_of(shown) == Some(pin)).cloned();
+            root.ok_or_else(|| io::Error::other("the root is gone"))
+        };
+        let late = |_| Error::NotShown(io::ErrorKind::TimedOut.into());
+        let not_shown = |error: io::Error| match is_other_root(&error) {
+            true => Error::OtherRoot { address: address.to_owned() },
+            false => Error::NotShown(error),
+        };
+        let root = timeout(SHOWN_WITHIN, shown).await.map_err(late)?.map_err(not_shown)?;
+        Ok(pem("CERTIFICATE", &root))
+    })
 }
 
 /// Whether a handshake failed since the server's root has another key than the pinned one.

@@ -20,6 +20,7 @@ use midshift_proto::sim::v1::sim_service_server::{SimService, SimServiceServer};
 use midshift_proto::status;
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use tonic::service::Routes;
 use tonic::{Request, Response, Status};
 
 /// An obstacle that stays until the body gives up.
@@ -41,9 +42,9 @@ impl SimFace {
     pub fn new(hall: Arc<Hall>, clock: Arc<dyn Clock>, crash: Crash) -> Self {
         Self { hall, clock, crash }
     }
-    /// Ready to be registered.
-    pub fn server(self) -> SimServiceServer<Self> {
-        SimServiceServer::new(self).max_decoding_message_size(CONTROL_MESSAGE_BYTES)
+    /// With this face.
+    pub fn add_to(self, routes: Routes) -> Routes {
+        routes.add_service(SimServiceServer::new(self).max_decoding_message_size(CONTROL_MESSAGE_BYTES))
     }
     fn inject(&self, request: v1::InjectFaultRequest) -> Result<(), Refusal> {
         let robot_id = RobotId::parse(&request.robot_id).map_err(|e| Refusal::field("robot_id", e.to_string()))?;

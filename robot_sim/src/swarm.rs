@@ -22,6 +22,7 @@ use midshift_agent::stop::line::StopLine;
 use midshift_agent::store::{self, Store};
 use midshift_agent::tls::Tls;
 use midshift_agent::trust::Trust;
+use midshift_core::Boxed;
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::StopLevel;
 use midshift_core::time::Clock;
@@ -179,42 +180,44 @@ impl Swarm {
         Arc::new(move |robot_id| crashes.get(robot_id).inspect(|c| c.notify_one()).is_some())
     }
     /// Runs every agent until `shutdown`. Errors: the first agent that cannot go on ends all.
-    pub async fn run(self, shutdown: CancellationToken) -> Result<SwarmEnd, Error> {
-        let ending = shutdown.child_token();
-        let _ends_all = ending.clone().drop_guard();
-        let mut agents = JoinSet::new();
-        let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed ^ 0x7377_6172);
-        let spread_us = self.config.spread.as_micros() as u64;
-        for robot in self.config.hall.robots() {
-            let life = Life {
-                config: self.config.clone(),
-                robot: robot.clone(),
-                crashes: self.crashes.clone(),
-                rng: ChaCha8Rng::seed_from_u64(rng.random()),
-                memory: MemoryStore::new(),
-                stops: MemoryStops::default(),
-                starts_after: Duration::from_micros(rng.random_range(0..=spread_us)),
-            };
-            agents.spawn(life.run(ending.clone()));
-        }
-        let person = walk(self.config.clone());
-        tokio::pin!(person);
-        let mut end = SwarmEnd::default();
-        loop {
-            let ended = tokio::select! {
-                ended = agents.join_next() => ended,
-                never = &mut person => match never {},
-            };
-            match ended {
-                None => return Ok(end),
-                Some(Ok(one)) => {
-                    let (fenced, crashes) = one?;
-                    end.fenced.extend(fenced);
-                    end.crashes += crashes;
-                }
-                Some(Err(panicked)) => std::panic::resume_unwind(panicked.into_panic()),
+    pub fn run(self, shutdown: CancellationToken) -> Boxed<'static, Result<SwarmEnd, Error>> {
+        Box::pin(async move {
+            let ending = shutdown.child_token();
+            let _ends_all = ending.clone().drop_guard();
+            let mut agents = JoinSet::new();
+            let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed ^ 0x7377_6172);
+            let spread_us = self.config.spread.as_micros() as u64;
+            for robot in self.config.hall.robots() {
+                let life = Life {
+                    config: self.config.clone(),
+                    robot: robot.clone(),
+                    crashes: self.crashes.clone(),
+                    rng: ChaCha8Rng::seed_from_u64(rng.random()),
+                    memory: MemoryStore::new(),
+                    stops: MemoryStops::default(),
+                    starts_after: Duration::from_micros(rng.random_range(0..=spread_us)),
+                };
+                agents.spawn(life.run(ending.clone()));
             }
-        }
+            let person = walk(self.config.clone());
+            tokio::pin!(person);
+            let mut end = SwarmEnd::default();
+            loop {
+                let ended = tokio::select! {
+                    ended = agents.join_next() => ended,
+                    never = &mut person => match never {},
+                };
+                match ended {
+                    None => return Ok(end),
+                    Some(Ok(one)) => {
+                        let (fenced, crashes) = one?;
+                        end.fenced.extend(fenced);
+                        end.crashes += crashes;
+                    }
+                    Some(Err(panicked)) => std::panic::resume_unwind(panicked.into_panic()),
+                }
+            }
+        })
     }
 }
 

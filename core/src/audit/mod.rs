@@ -9,7 +9,7 @@ pub use verify::{Broken, Chain, Ends, Export, Held, Mark, Verified};
 
 use crate::identity::{Actor, TokenId};
 use crate::reason::{self, Code, Refusal};
-use crate::rows::{Index, Item, Key, Record, Revision, Row, Table, Writer};
+use crate::rows::{Index, Item, Key, Record, Revision, Row, Table, Writer, body_is_json};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -276,6 +276,10 @@ pub struct AuditRow {
 }
 
 impl AuditRow {
+    /// The row with this body; none: it cannot be read.
+    pub fn read(body: &str) -> Option<Self> {
+        serde_json::from_str(body).ok()
+    }
     /// Whether it is about `id`: of this kind, or of any if `id` is written without one.
     pub fn is_about(&self, wanted: &str) -> bool {
         let same = |about: &String| about == wanted || about.split_once(':').is_some_and(|(_, id)| id == wanted);
@@ -374,6 +378,7 @@ macro_rules! chains {
 
         impl Record for $row {
             const TABLE: Table = Table::$table;
+            body_is_json!();
             fn id(&self) -> String {
                 id_of(self.0.n)
             }

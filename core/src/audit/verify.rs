@@ -145,7 +145,7 @@ impl Mark {
     /// What the anchor in this line quotes; nothing if it is none.
     pub fn in_line(line: &str) -> Vec<Self> {
         // Most lines have no such field, and are not worth to be read twice.
-        let row = line.contains("\"heads\"").then(|| serde_json::from_str::<AuditRow>(line).ok()).flatten();
+        let row = line.contains("\"heads\"").then(|| AuditRow::read(line)).flatten();
         row.iter().flat_map(Self::quoted).collect()
     }
     /// Reads `service:n:hash`; none: it is not of that form.
@@ -238,7 +238,7 @@ impl Chain {
             Some(read) if self.rows == 0 => read.n,
             _ => expected,
         };
-        let read: Option<AuditRow> = serde_json::from_str(body).ok();
+        let read = AuditRow::read(body);
         let altered = Broken::Altered { n: named(read.as_ref()) };
         let (Some(read), Some(opened)) = (read, open(body)) else { return Err(altered) };
         if read.service != self.service || read.n == 0 {
@@ -352,7 +352,7 @@ impl Held {
     }
     /// Takes a line behind the first. A chain is not read behind what is wrong with it.
     pub fn take(&mut self, line: &str) {
-        let named = serde_json::from_str::<AuditRow>(line).ok().map(|row| row.service);
+        let named = AuditRow::read(line).map(|row| row.service);
         // A line that cannot be read is of the first chain that has not ended: an export has them one after the other.
         let open = self.chains.iter().find(|(_, chain)| chain.has_more()).map(|(name, _)| name.clone());
         let Some(service) = named.or(open).or_else(|| self.chains.keys().next_back().cloned()) else { return };

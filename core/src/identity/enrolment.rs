@@ -7,7 +7,7 @@ use super::token::{Digest, TokenId};
 use crate::ids::RobotId;
 use crate::limits;
 use crate::reason::{Code, Kind, Reason, Refusal};
-use crate::rows::{Record, Table};
+use crate::rows::{Record, Table, body_is_json};
 use crate::time::Utc;
 use serde::{Deserialize, Serialize};
 
@@ -54,6 +54,7 @@ pub struct RobotIdentity {
 
 impl Record for RobotIdentity {
     const TABLE: Table = Table::RobotIdentity;
+    body_is_json!();
     fn id(&self) -> String {
         self.robot_id.to_string()
     }

@@ -3,7 +3,7 @@
 use super::grant::Grant;
 use super::token::{Digest, TokenId};
 use crate::limits;
-use crate::rows::{Index, Record, Table};
+use crate::rows::{Index, Record, Table, body_is_json};
 use crate::time::Utc;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -93,6 +93,7 @@ pub struct TokenName {
 
 impl Record for TokenName {
     const TABLE: Table = Table::TokenName;
+    body_is_json!();
     fn id(&self) -> String {
         self.name.clone()
     }
@@ -100,6 +101,7 @@ impl Record for TokenName {
 
 impl Record for TokenRecord {
     const TABLE: Table = Table::Token;
+    body_is_json!();
     fn id(&self) -> String {
         self.token_id.to_string()
     }
@@ -119,6 +121,7 @@ pub struct Authority {
 
 impl Record for Authority {
     const TABLE: Table = Table::Authority;
+    body_is_json!();
     fn id(&self) -> String {
         self.site_id.to_string()
     }
@@ -141,6 +144,7 @@ pub struct ServerCertificate {
 
 impl Record for ServerCertificate {
     const TABLE: Table = Table::ServerCertificate;
+    body_is_json!();
     fn id(&self) -> String {
         self.key.to_string()
     }

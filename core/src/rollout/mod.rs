@@ -148,7 +148,7 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
             plan.items.extend(tx.finish());
             continue;
         }
-        match serde_json::from_str::<InboxEntry>(body) {
+        match InboxEntry::parse(body) {
             Ok(said) => {
                 let mut tx = Tx::new(view, now, said.robot_id.as_str());
                 hear::take(&mut tx, &said);

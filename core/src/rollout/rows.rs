@@ -7,7 +7,7 @@ use crate::authority::Authority;
 use crate::gates::{Effort, Efforts, FailureEvidence, OutcomeEvidence, Suspicion, TaskTally};
 use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId};
 use crate::reason::Reason;
-use crate::rows::{Index, Record, Seq, Table};
+use crate::rows::{Index, Record, Seq, Table, body_is_json};
 use crate::time::Utc;
 use crate::update::{DesiredUpdate, UpdateReport};
 use serde::{Deserialize, Serialize};
@@ -16,6 +16,7 @@ use std::sync::Arc;
 
 impl Record for DesiredUpdate {
     const TABLE: Table = Table::DesiredUpdate;
+    body_is_json!();
     fn id(&self) -> String {
         self.robot_id.to_string()
     }
@@ -98,6 +99,7 @@ impl Bundle {
 
 impl Record for Bundle {
     const TABLE: Table = Table::Bundle;
+    body_is_json!();
     fn id(&self) -> String {
         self.bundle.to_string()
     }
@@ -381,6 +383,7 @@ impl Rollout {
 
 impl Record for Rollout {
     const TABLE: Table = Table::Rollout;
+    body_is_json!();
     fn id(&self) -> String {
         self.rollout_id.to_string()
     }
@@ -583,6 +586,7 @@ impl RolloutRobot {
 
 impl Record for RolloutRobot {
     const TABLE: Table = Table::RolloutRobot;
+    body_is_json!();
     fn id(&self) -> String {
         Self::id_of(&self.rollout_id, &self.robot_id)
     }
@@ -642,6 +646,7 @@ impl RobotSoftware {
 
 impl Record for RobotSoftware {
     const TABLE: Table = Table::RobotSoftware;
+    body_is_json!();
     fn id(&self) -> String {
         self.robot_id.to_string()
     }
@@ -671,6 +676,7 @@ impl Quarantine {
 
 impl Record for Quarantine {
     const TABLE: Table = Table::Quarantine;
+    body_is_json!();
     fn id(&self) -> String {
         Self::id_of(&self.robot_id, &self.bundle)
     }
@@ -690,6 +696,7 @@ pub struct AreaBundle {
 
 impl Record for AreaBundle {
     const TABLE: Table = Table::AreaBundle;
+    body_is_json!();
     fn id(&self) -> String {
         self.area_id.to_string()
     }
@@ -704,6 +711,7 @@ pub struct OtaMark {
 
 impl Record for OtaMark {
     const TABLE: Table = Table::OtaMark;
+    body_is_json!();
     fn id(&self) -> String {
         "ota".to_owned()
     }
@@ -720,6 +728,7 @@ pub struct OtaClock {
 
 impl Record for OtaClock {
     const TABLE: Table = Table::OtaClock;
+    body_is_json!();
     fn id(&self) -> String {
         "ota".to_owned()
     }

@@ -5,7 +5,7 @@ use super::scope::Scope;
 use crate::audit::Note;
 use crate::identity::Actor;
 use crate::ids::StopId;
-use crate::rows::{Expect, Index, Item, Record, Revision, Table, Writer};
+use crate::rows::{Expect, Index, Item, Record, Revision, Table, Writer, body_is_json};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -37,6 +37,7 @@ impl StopRecord {
 
 impl Record for StopRecord {
     const TABLE: Table = Table::StopRecord;
+    body_is_json!();
     fn id(&self) -> String {
         self.stop.stop_id.to_string()
     }

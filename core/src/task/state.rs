@@ -7,7 +7,7 @@ use crate::authority::Authority;
 use crate::ids::{AttemptId, PlaceId, RobotId, Subject, TaskId, WaypointId};
 use crate::reason::Reason;
 use crate::robot::Fault;
-use crate::rows::{Index, Record, Table};
+use crate::rows::{Index, Record, Table, body_is_json};
 use crate::time::Utc;
 use crate::work::WorkStats;
 use serde::{Deserialize, Serialize};
@@ -34,6 +34,7 @@ pub struct TaskIntake {
 
 impl Record for TaskIntake {
     const TABLE: Table = Table::TaskIntake;
+    body_is_json!();
     fn id(&self) -> String {
         self.task_id.to_string()
     }
@@ -133,6 +134,7 @@ impl TaskState {
 
 impl Record for TaskState {
     const TABLE: Table = Table::TaskState;
+    body_is_json!();
     fn id(&self) -> String {
         self.task_id.to_string()
     }
@@ -312,6 +314,7 @@ impl Attempt {
 
 impl Record for Attempt {
     const TABLE: Table = Table::Attempt;
+    body_is_json!();
     fn id(&self) -> String {
         self.attempt.to_string()
     }
@@ -414,6 +417,7 @@ pub struct TaskRequest {
 
 impl Record for TaskRequest {
     const TABLE: Table = Table::TaskRequest;
+    body_is_json!();
     fn id(&self) -> String {
         self.id.clone()
     }
@@ -441,6 +445,7 @@ pub struct RequestKey {
 
 impl Record for RequestKey {
     const TABLE: Table = Table::RequestKey;
+    body_is_json!();
     fn id(&self) -> String {
         self.id.clone()
     }

@@ -7,6 +7,7 @@ use super::keep::{self, KeepStops, Loaded};
 use super::{CheckIn, StopNews};
 use crate::dial::{Dial, SmallCodec};
 use crate::repeats::Repeats;
+use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
@@ -21,7 +22,7 @@ use midshift_proto::stop::v1;
 use prost::Message;
 use rand::{RngExt, SeedableRng};
 use std::fmt::Display;
-use std::future::{Future, pending};
+use std::future::pending;
 use std::ops::Range;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -54,7 +55,6 @@ const SOON_MS: Range<u64> = 1..500;
 /// Messages that may wait for the wire: check-ins of three seconds and of their changes. A line that is stuck this long is given up.
 const OUTBOUND: usize = 16;
 
-type Boxed<T> = Pin<Box<dyn Future<Output = T> + Send>>;
 /// The keeper comes back from each write, with its number.
 type Written = (Box<dyn KeepStops>, u64, Result<(), keep::Error>);
 
@@ -88,7 +88,7 @@ impl NoLine {
 enum Way {
     Idle,
     Waiting(Pin<Box<tokio::time::Sleep>>),
-    Dialing(Boxed<Result<Open, NoLine>>),
+    Dialing(Boxed<'static, Result<Open, NoLine>>),
 }
 
 /// What the line brings.
@@ -115,7 +115,7 @@ pub(crate) struct Line {
     /// Why there is no line, as the log was told.
     refused: Repeats,
     keeper: Option<Box<dyn KeepStops>>,
-    keeping: Option<Boxed<Written>>,
+    keeping: Option<Boxed<'static, Written>>,
 }
 
 impl Line {
@@ -340,7 +340,7 @@ async fn progress(way: &mut Way) -> Said {
     }
 }
 
-async fn written(keeping: &mut Option<Boxed<Written>>) -> Written {
+async fn written(keeping: &mut Option<Boxed<'static, Written>>) -> Written {
     match keeping {
         Some(writing) => writing.await,
         None => pending().await,

@@ -8,27 +8,23 @@ use crate::activity::{Activity, Unused};
 use crate::config::{Config, std};
 use crate::denials::Denials;
 use crate::frame_heads::{Counted, Flooded};
+use crate::listen::Io;
 use crate::peer::{ConnectionId, Denied, Peer, Principals};
-use crate::requests::{Door, Rules};
+use crate::requests::{Door, Rules, Services};
 use crate::seats::network;
 use crate::stranger::Stranger;
-use http::{Request, Response};
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto;
 use midshift_core::limits;
 use rustls::ServerConfig;
-use std::convert::Infallible;
 use std::net::SocketAddr;
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::{Semaphore, watch};
 use tokio::time::{sleep, timeout};
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
-use tonic::body::Body;
-use tower::Service;
 
 /// How a connection ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -74,9 +70,9 @@ impl End {
 }
 
 /// What all connections of a port share.
-pub(crate) struct Port<S> {
+pub(crate) struct Port {
     pub config: Config,
-    pub services: S,
+    pub services: Services,
     pub principals: Arc<dyn Principals>,
     pub denials: Option<Arc<Denials>>,
     pub tls: Option<watch::Receiver<Arc<ServerConfig>>>,
@@ -120,22 +116,15 @@ enum Reason {
     Old,
 }
 
-impl<S> Port<S>
-where
-    S: Service<Request<Body>, Response = Response<Body>, Error = Infallible> + Clone + Send + Sync + 'static,
-    S::Future: Send,
-{
+impl Port {
     /// From the first byte to the end. Dropping it cuts the connection.
-    pub async fn run<Io>(
+    pub async fn run(
         self: Arc<Self>,
-        io: Io,
+        io: Box<dyn Io>,
         address: SocketAddr,
         (id, stranger): (ConnectionId, Stranger),
         stop: CancellationToken,
-    ) -> End
-    where
-        Io: AsyncRead + AsyncWrite + Unpin + Send + 'static,
-    {
+    ) -> End {
         let Some(tls) = &self.tls else {
             return self.serve(io, Peer::new(address, None, id), stranger, stop).await;
         };
@@ -159,13 +148,10 @@ where
         };
         let shown = io.get_ref().1.peer_certificates().and_then(<[_]>::first);
         let leaf = shown.map(|leaf| leaf.clone().into_owned());
-        self.serve(io, Peer::new(address, leaf, id), stranger, stop).await
+        self.serve(Box::new(io), Peer::new(address, leaf, id), stranger, stop).await
     }
 
-    async fn serve<Io>(&self, io: Io, peer: Peer, stranger: Stranger, stop: CancellationToken) -> End
-    where
-        Io: AsyncRead + AsyncWrite + Unpin + Send + 'static,
-    {
+    async fn serve(&self, io: Box<dyn Io>, peer: Peer, stranger: Stranger, stop: CancellationToken) -> End {
         // Before asking, so that no change falls in between.
         let mut changed = self.principals.changed();
         let activity = Activity::new();
@@ -234,10 +220,7 @@ where
 
     /// Answers whatever is asked for a moment with why the certificate is denied, so that a robot can say so; then cuts.
     /// Its requests are judged as any others are: its certificate gives it no caller, so that no service hears of them.
-    async fn turn_away<Io>(&self, io: Io, mut door: Door<S>, denied: Denied) -> End
-    where
-        Io: AsyncRead + AsyncWrite + Unpin + Send + 'static,
-    {
+    async fn turn_away(&self, io: Box<dyn Io>, mut door: Door, denied: Denied) -> End {
         let end = self.denied(&door.peer, denied);
         if door.peer.certificate.is_some() {
             // That a connection was denied is told already.
@@ -308,10 +291,12 @@ fn failed_handshake(port: &'static str, address: SocketAddr, id: ConnectionId, e
 mod tests {
     use super::*;
     use bytes::Bytes;
+    use http::{Request, Response};
     use http_body::Frame;
     use http_body_util::StreamBody;
     use hyper::body::Incoming;
     use hyper::service::service_fn;
+    use std::convert::Infallible;
     use std::sync::atomic::{AtomicUsize, Ordering};
     use tokio::io::AsyncWriteExt;
     use tokio_stream::StreamExt;

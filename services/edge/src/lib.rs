@@ -30,7 +30,7 @@ pub mod tls;
 pub use config::{Age, Config, Rate};
 pub use denials::{Denial, Denials};
 pub use known::{Known, robot_of, serial_of};
-pub use listen::{Incoming, Listen};
+pub use listen::{Incoming, Listen, Listener};
 pub use peer::{Anybody, ConnectionId, Denied, Peer, Principals};
 pub use room::{TooFew, connections_max};
 
@@ -38,9 +38,9 @@ use accept::Accept;
 use config::std;
 use connection::{End, Port};
 use http::{Request, Response};
-use midshift_core::limits;
 use midshift_core::overload::Class;
-use requests::Rules;
+use midshift_core::{Boxed, limits};
+use requests::{Rules, Services};
 use rustls::ServerConfig;
 use seats::{Full, Seat, Seats, network};
 use std::convert::Infallible;
@@ -52,11 +52,11 @@ use tokio::task::{JoinError, JoinSet};
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 use tonic::body::Body;
-use tower::Service;
+use tower::{Service, ServiceExt};
 
 /// One port: its services and its limits.
-pub struct Edge<S> {
-    port: Port<S>,
+pub struct Edge {
+    port: Port,
 }
 
 /// How serving ended.
@@ -68,14 +68,21 @@ pub struct Served {
     pub cut: usize,
 }
 
-impl<S> Edge<S>
-where
-    S: Service<Request<Body>, Response = Response<Body>, Error = Infallible> + Clone + Send + Sync + 'static,
-    S::Future: Send,
-{
+impl Edge {
     /// `services` (tonic's `Routes`) behind the limits of `config`, for whom `principals` lets in. Plain text without [`Edge::with_tls`].
-    pub fn new(config: Config, principals: Arc<dyn Principals>, services: S) -> Self {
+    pub fn new<S>(config: Config, principals: Arc<dyn Principals>, services: S) -> Self
+    where
+        S: Service<Request<Body>, Response = Response<Body>, Error = Infallible> + Clone + Send + Sync + 'static,
+        S::Future: Send,
+    {
         let (rules, http) = (Arc::new(Rules::new(&config)), connection::http(&config));
+        let services: Services = Arc::new(move |request| {
+            let answer = services.clone().oneshot(request);
+            Box::pin(async {
+                let Ok(response) = answer.await;
+                response
+            })
+        });
         Self { port: Port { config, services, principals, denials: None, tls: None, rules, http } }
     }
 
@@ -93,7 +100,11 @@ where
 
     /// Serves until `stop`, or until `listener` has no more; then each connection is asked to go, and what is left after the drain's time
     /// is cut. Dropping the future cuts everything.
-    pub async fn serve<L: Listen>(self, listener: L, stop: CancellationToken) -> Served {
+    pub fn serve(self, listener: impl Listen, stop: CancellationToken) -> Boxed<'static, Served> {
+        Box::pin(self.serve_all(Listener::new(listener), stop))
+    }
+
+    async fn serve_all(self, listener: Listener, stop: CancellationToken) -> Served {
         let shared = Arc::new(self.port);
         let (config, name) = (&shared.config, shared.config.port);
         let places = Places::new(config, shared.tls.is_some());

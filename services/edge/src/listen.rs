@@ -3,7 +3,7 @@
 //! Invariant: says what the system says. No retry, no pause and no error is swallowed here.
 
 use crate::config::std;
-use midshift_core::limits;
+use midshift_core::{Boxed, limits};
 use rustix::net::sockopt;
 use std::io;
 use std::net::SocketAddr;
@@ -21,6 +21,44 @@ pub trait Listen: Send + 'static {
     /// # Errors
     /// As the system says; the caller decides by its kind whether to go on at once.
     fn accept(&mut self) -> impl Future<Output = io::Result<Option<(Self::Io, SocketAddr)>>> + Send;
+}
+
+/// One connection of whatever kind: what serves it is compiled once, in this crate.
+pub trait Io: AsyncRead + AsyncWrite + Unpin + Send + 'static {}
+
+impl<T: AsyncRead + AsyncWrite + Unpin + Send + 'static> Io for T {}
+
+/// A source of connections of whatever kind.
+pub struct Listener(Box<dyn Accepts>);
+
+impl Listener {
+    /// Of `source`.
+    pub fn new(source: impl Listen) -> Self {
+        Self(Box::new(source))
+    }
+}
+
+type Accepted = io::Result<Option<(Box<dyn Io>, SocketAddr)>>;
+
+trait Accepts: Send {
+    fn accept_boxed(&mut self) -> Boxed<'_, Accepted>;
+}
+
+impl<L: Listen> Accepts for L {
+    fn accept_boxed(&mut self) -> Boxed<'_, Accepted> {
+        Box::pin(async {
+            let accepted = self.accept().await?;
+            Ok(accepted.map(|(io, address)| (Box::new(io) as Box<dyn Io>, address)))
+        })
+    }
+}
+
+impl Listen for Listener {
+    type Io = Box<dyn Io>;
+
+    fn accept(&mut self) -> impl Future<Output = Accepted> + Send {
+        self.0.accept_boxed()
+    }
 }
 
 impl Listen for TcpListener {

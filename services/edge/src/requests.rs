@@ -17,21 +17,19 @@ use http::{HeaderMap, Request, Response, Uri};
 use hyper::body::Incoming;
 use hyper::service::Service as HyperService;
 use midshift_core::identity::{Actor, Caller, Who};
-use midshift_core::limits;
 use midshift_core::overload::Class;
 use midshift_core::overload::bugs::Bugs;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::{Boxed, limits};
 use midshift_proto::denying::Told;
 use midshift_proto::{Denying, access};
 use std::convert::Infallible;
 use std::net::IpAddr;
-use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, timeout_at};
 use tonic::body::Body;
-use tower::{Service, ServiceExt};
 
 /// What all requests of a port share.
 pub(crate) struct Rules {
@@ -127,9 +125,12 @@ impl Drop for Inside {
     }
 }
 
+/// The services of a port, of whatever kind: what is before them is compiled once, in this crate.
+pub(crate) type Services = Arc<dyn Fn(Request<Body>) -> Boxed<'static, Response<Body>> + Send + Sync>;
+
 /// The services, as one connection reaches them.
-pub(crate) struct Door<S> {
-    pub services: S,
+pub(crate) struct Door {
+    pub services: Services,
     pub rules: Arc<Rules>,
     pub activity: Activity,
     pub peer: Peer,
@@ -140,7 +141,7 @@ pub(crate) struct Door<S> {
     pub batches: Arc<Semaphore>,
 }
 
-impl<S> Door<S> {
+impl Door {
     /// Its place among the batches of this connection, if it is one.
     fn batch(&self, path: &str) -> Result<Option<OwnedSemaphorePermit>, Refusal> {
         if !access::is_batch(path) {
@@ -234,14 +235,10 @@ impl Told for Inward {
     }
 }
 
-impl<S> HyperService<Request<Incoming>> for Door<S>
-where
-    S: Service<Request<Body>, Response = Response<Body>, Error = Infallible> + Clone + Send + 'static,
-    S::Future: Send,
-{
+impl HyperService<Request<Incoming>> for Door {
     type Response = Response<Bounded<Held>>;
     type Error = Infallible;
-    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, Infallible>> + Send>>;
+    type Future = Boxed<'static, Result<Self::Response, Infallible>>;
 
     fn call(&self, mut request: Request<Incoming>) -> Self::Future {
         let (stream, now) = (self.activity.begin(), Instant::now());
@@ -264,9 +261,9 @@ where
         request.extensions_mut().insert(denying);
         request.extensions_mut().insert(caller);
         let head = deadline.map_or(now + self.rules.head, |deadline| deadline.min(now + self.rules.head));
-        let answer = self.services.clone().oneshot(request.map(Body::new));
+        let answer = (self.services)(request.map(Body::new));
         Box::pin(async move {
-            let Ok(Ok(response)) = timeout_at(head, answer).await else {
+            let Ok(response) = timeout_at(head, answer).await else {
                 let late = speech.refuse(&deadline::over());
                 return Ok(late.map(|body| Bounded::new(body, None, over, speech, (stream, Some(seat)))));
             };

@@ -12,11 +12,13 @@ mod standby;
 
 pub use retention::prune;
 
+use midshift_core::Boxed;
 use midshift_core::fleet::Board;
 use midshift_core::fleet::commands::Command;
 use midshift_core::fleet::maps::MapChange;
 use midshift_core::fleet::projection::View;
 use midshift_core::identity::Caller;
+use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::rows::Revision;
 use midshift_core::site::Site;
@@ -29,6 +31,7 @@ use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding;
+use tonic::service::Routes;
 
 /// Requests that may wait for the reconciler; one more is told to come back.
 const REQUESTS_MAX: usize = 256;
@@ -112,9 +115,10 @@ impl FleetService {
         let (store, site) = (parts.store.clone(), parts.site.clone());
         (Self { requests: sender, store, site }, Reconciler { parts, requests })
     }
-    /// The gRPC face.
-    pub fn grpc(&self) -> FleetServiceServer<Self> {
-        FleetServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
+    /// With the gRPC face.
+    pub fn add_to(&self, routes: Routes) -> Routes {
+        let face = FleetServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip);
+        routes.add_service(face.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
     }
 
     /// How often a robot began to wait for a place since the start.
@@ -162,7 +166,7 @@ impl Reconciler {
     ///
     /// # Errors
     /// It ends early because its map is outdated.
-    pub async fn run(self, shutdown: CancellationToken) -> Result<(), MapOutdated> {
-        reconcile::run(self.parts, self.requests, shutdown).await
+    pub fn run(self, shutdown: CancellationToken) -> Boxed<'static, Result<(), MapOutdated>> {
+        Box::pin(reconcile::run(self.parts, self.requests, shutdown))
     }
 }

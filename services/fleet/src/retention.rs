@@ -7,6 +7,7 @@
 //!
 //! Called by the binary now and then.
 
+use midshift_core::Boxed;
 use midshift_core::fleet::projection;
 use midshift_core::fleet::rows::RobotCounter;
 use midshift_core::ids::{AttemptId, Subject};
@@ -28,14 +29,16 @@ const TASKS_AT_ONCE: usize = 200;
 ///
 /// # Errors
 /// If the store does not answer.
-pub async fn prune(store: &dyn Store, clock: &dyn Clock) -> Result<u64, Error> {
+pub fn prune<'a>(store: &'a dyn Store, clock: &dyn Clock) -> Boxed<'a, Result<u64, Error>> {
     let now = clock.now();
-    let utc = now.steady_utc();
-    let tasks = prune_tasks(store, utc).await?;
-    let errands = prune_errands(store, utc).await?;
-    let counters = prune_counters(store, utc).await?;
-    let robots = aged::forget_robots(store, Writer::Fleet, utc).await?;
-    Ok(tasks + errands + counters + robots + prune_commands(store, now.steady_wall()).await?)
+    Box::pin(async move {
+        let utc = now.steady_utc();
+        let tasks = prune_tasks(store, utc).await?;
+        let errands = prune_errands(store, utc).await?;
+        let counters = prune_counters(store, utc).await?;
+        let robots = aged::forget_robots(store, Writer::Fleet, utc).await?;
+        Ok(tasks + errands + counters + robots + prune_commands(store, now.steady_wall()).await?)
+    })
 }
 
 /// A used request_id goes with the commands after it; where there are none, here.

@@ -23,6 +23,7 @@ pub use retention::prune;
 pub use revocation_list::RevocationList;
 
 use authority::{Authority, asked};
+use midshift_core::Boxed;
 use midshift_core::audit::Note;
 use midshift_core::identity::{Authority as AuthorityRow, Directory, Secret, ServerCertificate, revocations};
 use midshift_core::ids::SiteId;
@@ -40,6 +41,7 @@ use std::time::Duration;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding;
+use tonic::service::Routes;
 
 /// Rows are looked at so often although nobody woke us, link clock: time alone changes who is known.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
@@ -161,7 +163,11 @@ impl IdentityService {
     ///
     /// # Errors
     /// Files, the store, or nobody who signs.
-    pub async fn open(parts: Parts, shutdown: &CancellationToken) -> Result<Self, Error> {
+    pub fn open(parts: Parts, shutdown: &CancellationToken) -> Boxed<'_, Result<Self, Error>> {
+        Box::pin(Self::opening(parts, shutdown))
+    }
+
+    async fn opening(parts: Parts, shutdown: &CancellationToken) -> Result<Self, Error> {
         let Parts { folder, store, clock, duty, names, trust_json } = parts;
         files::make_folder(&folder)?;
         let site_id = store.site_id().clone();
@@ -200,7 +206,11 @@ impl IdentityService {
     }
 
     /// Keeps up with the rows, signs what servers ask for, and renews its own certificate, until `shutdown`.
-    pub async fn run(&self, shutdown: CancellationToken) {
+    pub fn run(&self, shutdown: CancellationToken) -> Boxed<'_, ()> {
+        Box::pin(self.running(shutdown))
+    }
+
+    async fn running(&self, shutdown: CancellationToken) {
         let (mut wake, mut tick) = (self.0.store.wake(), tokio::time::interval(LOOK_EVERY));
         let mut failing = false;
         loop {
@@ -246,11 +256,13 @@ impl IdentityService {
     ///
     /// # Errors
     /// The store, or the disk.
-    pub async fn append_revocations(&self, list: &RevocationList) -> Result<(), Error> {
-        let revoked = self.0.register.look(|view| {
-            revocations(view.tokens.values().map(|(token, _)| token), view.robots.values().map(|(robot, _)| robot))
-        });
-        list.append(&revoked.await.map_err(Error::Store)?).await
+    pub fn append_revocations<'a>(&'a self, list: &'a RevocationList) -> Boxed<'a, Result<(), Error>> {
+        Box::pin(async {
+            let revoked = self.0.register.look(|view| {
+                revocations(view.tokens.values().map(|(token, _)| token), view.robots.values().map(|(robot, _)| robot))
+            });
+            list.append(&revoked.await.map_err(Error::Store)?).await
+        })
     }
 
     /// What ports may know of people, programs and robots.
@@ -261,29 +273,32 @@ impl IdentityService {
     pub fn proof(&self) -> watch::Receiver<ServerProof> {
         self.0.proof.subscribe()
     }
-    /// Rights and robots, of a process with the authority.
-    pub fn identity(&self) -> IdentityServiceServer<Self> {
-        IdentityServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
-    }
-    /// Enrolment, of a process with the authority.
-    pub fn enrolment(&self) -> EnrolmentServiceServer<Self> {
-        EnrolmentServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
+    /// With rights and robots, and with enrolment, of a process with the authority.
+    pub fn add_to(&self, routes: Routes) -> Routes {
+        let identity = IdentityServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip);
+        let enrolment = EnrolmentServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip);
+        routes
+            .add_service(identity.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
+            .add_service(enrolment.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
     }
 
     /// The first token of a site that has none: may do everything. None if there is one.
     ///
     /// # Errors
     /// The store does not answer.
-    pub async fn first_token(&self) -> Result<Option<String>, Error> {
-        Ok(tokens::first(&self.0.register, self.0.clock.now().wall).await?.map(|secret| secret.reveal(Secret::TOKEN)))
+    pub fn first_token(&self) -> Boxed<'_, Result<Option<String>, Error>> {
+        Box::pin(async {
+            let first = tokens::first(&self.0.register, self.0.clock.now().wall).await?;
+            Ok(first.map(|secret| secret.reveal(Secret::TOKEN)))
+        })
     }
 
     /// Another such token, for whoever has lost the first one and has the machine.
     ///
     /// # Errors
     /// The store does not answer.
-    pub async fn spare_token(&self) -> Result<String, Error> {
-        Ok(tokens::spare(&self.0.register, self.0.clock.now().wall).await?.reveal(Secret::TOKEN))
+    pub fn spare_token(&self) -> Boxed<'_, Result<String, Error>> {
+        Box::pin(async { Ok(tokens::spare(&self.0.register, self.0.clock.now().wall).await?.reveal(Secret::TOKEN)) })
     }
 }
 

@@ -8,6 +8,7 @@
 //!
 //! Called by the binary now and then.
 
+use midshift_core::Boxed;
 use midshift_core::fleet::rows::RobotControl;
 use midshift_core::identity::{RobotIdentity, ServerCertificate, TokenName, TokenRecord};
 use midshift_core::limits;
@@ -21,10 +22,12 @@ use std::sync::Arc;
 ///
 /// # Errors
 /// If the store does not answer.
-pub async fn prune(store: &dyn Store, clock: &dyn Clock) -> Result<u64, Error> {
+pub fn prune<'a>(store: &'a dyn Store, clock: &dyn Clock) -> Boxed<'a, Result<u64, Error>> {
     let now = clock.now();
-    let wall = now.steady_wall();
-    Ok(prune_tokens(store, wall).await? + prune_servers(store, wall).await? + prune_robots(store, &now).await?)
+    Box::pin(async move {
+        let wall = now.steady_wall();
+        Ok(prune_tokens(store, wall).await? + prune_servers(store, wall).await? + prune_robots(store, &now).await?)
+    })
 }
 
 fn item() -> Item {

@@ -17,6 +17,7 @@ use midshift_agent::trust::Trust;
 use midshift_cli::roles::Roles;
 use midshift_cli::site_file::{self, Loaded};
 use midshift_cli::task_list::read_list;
+use midshift_core::Boxed;
 use midshift_core::site::{Site, grid};
 use midshift_core::task::Phase;
 use midshift_core::time::{Clock, SiteTime};
@@ -140,7 +141,11 @@ const WATCHED: std::ops::RangeInclusive<Duration> = Duration::from_secs(1)..=Dur
 const BEACONS: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 7422);
 
 /// Runs until `stop`, Ctrl-C's token, or the end of `--for`. The report is of the whole run.
-pub async fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Result<Report> {
+pub fn run(args: Dev, stop: CancellationToken, say: Say<'_>) -> Boxed<'_, anyhow::Result<Report>> {
+    Box::pin(play(args, stop, say))
+}
+
+async fn play(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Result<Report> {
     if !args.listen.ip().is_loopback() {
         bail!("dev listens on loopback only; use `midshift serve`");
     }

@@ -3,12 +3,13 @@
 //! Invariant: every port of the binary has this door and no other; what a request may do was decided before a service sees it.
 
 use anyhow::Context;
+use midshift_core::Boxed;
 use midshift_core::identity::Directory;
 use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_edge::tls::{Clients, server_config};
-use midshift_edge::{Anybody, Config, Denials, Edge, Known, Listen, Rate, connections_max};
+use midshift_edge::{Anybody, Config, Denials, Edge, Known, Listen, Listener, Rate, connections_max};
 use midshift_identity::ServerProof;
 use rustls::ServerConfig;
 use rustls::pki_types::pem::PemObject;
@@ -107,11 +108,21 @@ impl Login {
 ///
 /// # Errors
 /// What the port is to prove itself with cannot be used.
-pub async fn serve<L: Listen>(
+pub fn serve(
     config: Config,
     login: Option<Login>,
     services: Routes,
-    listener: L,
+    listener: impl Listen,
+    stop: CancellationToken,
+) -> Boxed<'static, anyhow::Result<()>> {
+    Box::pin(serve_all(config, login, services, Listener::new(listener), stop))
+}
+
+async fn serve_all(
+    config: Config,
+    login: Option<Login>,
+    services: Routes,
+    listener: Listener,
     stop: CancellationToken,
 ) -> anyhow::Result<()> {
     let Some(login) = login else {

@@ -9,6 +9,7 @@ use midshift_agent::enrolment::{Enrolled, Identity, Invitation};
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::tls::Tls;
 use midshift_cli::way::Way;
+use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
 use midshift_core::time::Clock;
 use midshift_proto::identity::v1::CreateEnrolmentRequest;
@@ -33,23 +34,30 @@ impl Machines {
     ///
     /// # Errors
     /// The server says no.
-    pub async fn enrol(way: &Way, server: &str, robots: Vec<RobotId>, data: Option<&Path>) -> anyhow::Result<Self> {
-        let (room, line) = (Arc::new(Semaphore::new(AT_ONCE)), way.lazy());
-        let mut joined = JoinSet::new();
-        for robot_id in robots {
-            let (client, server) = (IdentityServiceClient::new(line.clone()), server.to_owned());
-            let (folder, room) = (data.map(|data| data.join(robot_id.as_str())), room.clone());
-            joined.spawn(async move {
-                let _place = room.acquire_owned().await?;
-                let machine = machine(client, &server, &robot_id, folder).await;
-                machine.with_context(|| format!("enrolling {robot_id}"))
-            });
-        }
-        let mut machines = Vec::with_capacity(joined.len());
-        while let Some(machine) = joined.join_next().await {
-            machines.push(machine??);
-        }
-        Ok(Self(machines))
+    pub fn enrol<'a>(
+        way: &'a Way,
+        server: &'a str,
+        robots: Vec<RobotId>,
+        data: Option<&'a Path>,
+    ) -> Boxed<'a, anyhow::Result<Self>> {
+        Box::pin(async move {
+            let (room, line) = (Arc::new(Semaphore::new(AT_ONCE)), way.lazy());
+            let mut joined = JoinSet::new();
+            for robot_id in robots {
+                let (client, server) = (IdentityServiceClient::new(line.clone()), server.to_owned());
+                let (folder, room) = (data.map(|data| data.join(robot_id.as_str())), room.clone());
+                joined.spawn(async move {
+                    let _place = room.acquire_owned().await?;
+                    let machine = machine(client, &server, &robot_id, folder).await;
+                    machine.with_context(|| format!("enrolling {robot_id}"))
+                });
+            }
+            let mut machines = Vec::with_capacity(joined.len());
+            while let Some(machine) = joined.join_next().await {
+                machines.push(machine??);
+            }
+            Ok(Self(machines))
+        })
     }
 
     /// How each of them speaks to the site.

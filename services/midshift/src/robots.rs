@@ -9,6 +9,7 @@ use midshift_agent::core::ExitReason;
 use midshift_agent::program::{Machine, Ways};
 use midshift_cli::site_file;
 use midshift_cli::way::{Way, with_scheme};
+use midshift_core::Boxed;
 use midshift_core::ids::WaypointId;
 use midshift_core::time::Clock;
 use midshift_sim::body::{BodyConfig, SimBody};
@@ -112,16 +113,23 @@ fn part(text: &str) -> Result<(usize, usize), String> {
 }
 
 /// Runs one agent until `stop`. Fenced twice is an error: another machine has this robot's name.
-pub async fn agent(args: AgentRun, stop: CancellationToken) -> anyhow::Result<ExitReason> {
-    agent_in_hand(args, |_, _| (), stop).await
+pub fn agent(args: AgentRun, stop: CancellationToken) -> Boxed<'static, anyhow::Result<ExitReason>> {
+    agent_in_hand(args, |_, _| (), stop)
 }
 
 /// As [`agent`]; `hand` is given its body before it starts, and the clocks of the process, to do something to it later.
-pub async fn agent_in_hand(
+pub fn agent_in_hand(
     args: AgentRun,
-    hand: impl FnOnce(&SimHandle, &Arc<dyn Clock>),
+    hand: impl FnOnce(&SimHandle, &Arc<dyn Clock>) + Send + 'static,
     stop: CancellationToken,
-) -> anyhow::Result<ExitReason> {
+) -> Boxed<'static, anyhow::Result<ExitReason>> {
+    Box::pin(one_agent(args, Box::new(hand), stop))
+}
+
+/// Whoever is given a body and the clocks.
+type Hand = Box<dyn FnOnce(&SimHandle, &Arc<dyn Clock>) + Send>;
+
+async fn one_agent(args: AgentRun, hand: Hand, stop: CancellationToken) -> anyhow::Result<ExitReason> {
     let robot_id = args.config.robot_id()?;
     let site = site_file::load(args.site.as_deref(), None, None)?.site;
     let clock = clock::clock(1000);
@@ -176,7 +184,11 @@ async fn visit(robot: SimHandle, seed: u64, clock: Arc<dyn Clock>) {
 }
 
 /// Runs a swarm until `stop`; enrolled by whoever is signed in, or in plain text.
-pub async fn swarm(args: SimRun, signed_in: Option<Way>, stop: CancellationToken) -> anyhow::Result<()> {
+pub fn swarm(args: SimRun, signed_in: Option<Way>, stop: CancellationToken) -> Boxed<'static, anyhow::Result<()>> {
+    Box::pin(swarming(args, signed_in, stop))
+}
+
+async fn swarming(args: SimRun, signed_in: Option<Way>, stop: CancellationToken) -> anyhow::Result<()> {
     let site = site_file::load(args.site.as_deref(), None, None)?.site;
     let clock: Arc<dyn Clock> = clock::clock(1000);
     let mut config = HallConfig::new(site, args.robots, args.seed);
@@ -215,7 +227,7 @@ pub async fn swarm(args: SimRun, signed_in: Option<Way>, stop: CancellationToken
         None => drop(robots.await?),
         Some(address) => {
             let listener = TcpListener::bind(address).await.with_context(|| format!("listening on {address}"))?;
-            let routes = Routes::new(face.server());
+            let routes = face.add_to(Routes::default());
             let served = door::serve(door::alone("sim"), None, routes, listener, stop);
             let (robots, served) = tokio::join!(robots, served);
             robots?;

@@ -12,6 +12,7 @@ use clap::ValueEnum;
 use midshift_agent::tls;
 use midshift_cli::roles::{Role, Roles};
 use midshift_cli::site_file;
+use midshift_core::Boxed;
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_identity::{Duty, IdentityService};
@@ -133,15 +134,17 @@ pub struct Software {
 
 impl Software {
     /// The service, with its files in `folder`, which is `owner`'s.
-    pub async fn open(&self, folder: PathBuf, owner: Owner, clock: Arc<dyn Clock>) -> anyhow::Result<OtaService> {
-        let Some(keys) = self.ota_keys.clone() else { return Ok(OtaService::without_keys()) };
-        let room = Room {
-            quota_bytes: self.ota_quota_gib << 30,
-            spare_bytes: self.ota_spare_gib << 30,
-            unnamed_ms: self.ota_keep_days * 24 * 3_600_000,
-        };
-        let parts = midshift_ota::Parts { folder, keys, room, clock, owner };
-        OtaService::open(parts).await.context("opening software of robots")
+    pub fn open(&self, folder: PathBuf, owner: Owner, clock: Arc<dyn Clock>) -> Boxed<'_, anyhow::Result<OtaService>> {
+        Box::pin(async move {
+            let Some(keys) = self.ota_keys.clone() else { return Ok(OtaService::without_keys()) };
+            let room = Room {
+                quota_bytes: self.ota_quota_gib << 30,
+                spare_bytes: self.ota_spare_gib << 30,
+                unnamed_ms: self.ota_keep_days * 24 * 3_600_000,
+            };
+            let parts = midshift_ota::Parts { folder, keys, room, clock, owner };
+            OtaService::open(parts).await.context("opening software of robots")
+        })
     }
 }
 
@@ -168,7 +171,11 @@ impl Serve {
 pub type Say<'a> = &'a (dyn Fn(&str) + Sync);
 
 /// Runs until `shutdown`. The first token of a site is said, and nothing else.
-pub async fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow::Result<()> {
+pub fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> Boxed<'_, anyhow::Result<()>> {
+    Box::pin(serve(args, shutdown, say))
+}
+
+async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow::Result<()> {
     let roles = Roles::of(&args.roles);
     check_arguments(&args, &roles)?;
     // Before anything is opened: whoever finds the port taken leaves no trace.

@@ -15,14 +15,13 @@ use axum::routing::get;
 use http::StatusCode;
 use midshift_cli::roles::Role;
 use midshift_cli::site_answer::SiteAnswer;
-use midshift_core::limits;
 use midshift_core::work::Live;
-use midshift_edge::{Denials, Listen};
+use midshift_core::{Boxed, limits};
+use midshift_edge::{Denials, Listen, Listener};
 use midshift_fleet::{FleetService, Reconciler};
 use midshift_identity::audit::AuditService;
 use midshift_ota::rollouts::{Planner, RolloutService};
-use midshift_proto::sim::v1::sim_service_server::{self, SimServiceServer};
-use midshift_sim::service::SimFace;
+use midshift_proto::sim::v1::sim_service_server;
 use midshift_store::LiveBoard;
 use midshift_task::TaskService;
 use midshift_telemetry::TelemetryService;
@@ -57,7 +56,11 @@ pub struct Server {
 
 impl Server {
     /// Builds the services; nothing runs yet. They end some time after `stop`.
-    pub async fn new(mut parts: Parts, stop: CancellationToken) -> anyhow::Result<Self> {
+    pub fn new(parts: Parts, stop: CancellationToken) -> Boxed<'static, anyhow::Result<Self>> {
+        Box::pin(Self::build(parts, stop))
+    }
+
+    async fn build(mut parts: Parts, stop: CancellationToken) -> anyhow::Result<Self> {
         parts.ota = parts.ota.with_rows(parts.store.clone());
         parts.reader = parts.reader.map(|reader| reader.with_rows(parts.store.clone()));
         let board: Arc<LiveBoard<Live>> = LiveBoard::new();
@@ -142,44 +145,34 @@ impl Server {
         let (health, health_service) = tonic_health::server::health_reporter();
         let health_service = health_service.max_decoding_message_size(limits::HEALTH_MESSAGE_BYTES);
         let said = SiteAnswer { site_id: self.parts.site.site_id().to_string(), stop_port: self.parts.stop_port };
-        let mut routes = Routes::builder();
-        routes
-            .add_service(said.layer(self.parts.clock.clone(), self.parts.jumped_before).named_layer(health_service))
+        let said = said.layer(self.parts.clock.clone(), self.parts.jumped_before);
+        let mut routes = Routes::new(said.named_layer(health_service))
             .add_service(reflection().build_v1()?.max_decoding_message_size(control))
             .add_service(reflection().build_v1alpha()?.max_decoding_message_size(control));
         if let Some(task) = &self.task {
             let audit = AuditService::new(self.parts.store.clone(), self.parts.clock.clone(), self.shutdown.clone());
-            routes
-                .add_service(task.grpc().max_decoding_message_size(limits::TASK_MESSAGE_BYTES))
-                .add_service(audit.grpc().max_decoding_message_size(control));
+            routes = audit.add_to(task.add_to(routes));
         }
         if let Some((fleet, _)) = &self.fleet {
-            routes.add_service(fleet.grpc().max_decoding_message_size(control));
+            routes = fleet.add_to(routes);
         }
         if let Some(telemetry) = &self.telemetry {
-            routes
-                .add_service(telemetry.grpc().max_decoding_message_size(control))
-                .add_service(telemetry.link())
-                .add_service(telemetry.replay());
+            routes = telemetry.add_to(routes);
         }
         if let Some((rollouts, _)) = &self.rollouts {
-            routes
-                .add_service(self.parts.ota.bundles())
-                .add_service(rollouts.grpc().max_decoding_message_size(control));
+            routes = rollouts.add_to(self.parts.ota.add_bundles_to(routes));
         }
         if let Some(identity) = self.parts.identity.as_ref().filter(|_| self.parts.roles.has(Role::Identity)) {
-            routes.add_service(identity.identity().max_decoding_message_size(control));
-            routes.add_service(identity.enrolment().max_decoding_message_size(control));
+            routes = identity.add_to(routes);
         }
         let has_bytes = self.telemetry.is_some() || self.rollouts.is_some();
         match &self.parts.reader {
-            Some(reader) => drop(routes.add_service(reader.chunks()).add_service(reader.bundles())),
-            None if has_bytes => drop(routes.add_service(self.parts.ota.chunks())),
+            Some(reader) => routes = reader.add_to(routes),
+            None if has_bytes => routes = self.parts.ota.add_chunks_to(routes),
             None => {}
         }
         if let Some(sim) = self.parts.sim.clone() {
-            let face: SimServiceServer<SimFace> = sim.server();
-            routes.add_service(face);
+            routes = sim.add_to(routes);
         }
         let handle = recorder::handle();
         let metrics = move || {
@@ -187,7 +180,7 @@ impl Server {
             async move { handle.map(|h| h.render()).unwrap_or_default() }
         };
         // Browsers speak gRPC-Web to the services; Prometheus and clients of TUF speak plain HTTP/1.1 to the pages beside them.
-        let services = routes.routes().into_axum_router().layer(tonic_web::GrpcWebLayer::new());
+        let services = routes.into_axum_router().layer(tonic_web::GrpcWebLayer::new());
         let ready = self.ready.clone();
         let readiness = move || {
             let ready = *ready.borrow();
@@ -206,7 +199,11 @@ impl Server {
     ///
     /// # Errors
     /// If a service ends before shutdown; everything else has been shut down then.
-    pub async fn serve(self, listener: impl Listen) -> anyhow::Result<()> {
+    pub fn serve(self, listener: impl Listen) -> Boxed<'static, anyhow::Result<()>> {
+        Box::pin(self.serve_all(Listener::new(listener)))
+    }
+
+    async fn serve_all(self, listener: Listener) -> anyhow::Result<()> {
         let (routes, health) = self.routes().await?;
         let (stop, shutdown) = (self.stop.clone(), self.shutdown.clone());
         // However this ends, also in a panic: nobody goes on without it.

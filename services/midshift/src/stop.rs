@@ -19,6 +19,7 @@ use crate::{clock, recorder};
 use anyhow::{Context, bail, ensure};
 use axum::routing::get;
 use midshift_cli::site_file;
+use midshift_core::Boxed;
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, LinkDuration, Utc};
 use midshift_edge::{Config, Denial, Denials};
@@ -72,12 +73,14 @@ pub struct StopServe {
 ///
 /// # Errors
 /// The folder cannot be used or another process has it, the port is taken, or a part ended by itself.
-pub async fn run(args: StopServe, shutdown: CancellationToken) -> anyhow::Result<()> {
-    let opened = OnceLock::new();
-    tokio::select! {
-        served = run_watched(args, shutdown, &opened) => served,
-        () = manager::is_watched(&opened) => Ok(()),
-    }
+pub fn run(args: StopServe, shutdown: CancellationToken) -> Boxed<'static, anyhow::Result<()>> {
+    Box::pin(async move {
+        let opened = OnceLock::new();
+        tokio::select! {
+            served = run_watched(args, shutdown, &opened) => served,
+            () = manager::is_watched(&opened) => Ok(()),
+        }
+    })
 }
 
 async fn run_watched(

@@ -1,6 +1,7 @@
 //! Where a server keeps its rows and samples: files of its own, or a PostgreSQL database.
 
 use anyhow::{Context, bail};
+use midshift_core::Boxed;
 use midshift_core::ids::SiteId;
 use midshift_core::time::Clock;
 use midshift_store::{
@@ -38,31 +39,40 @@ impl Database {
     }
 
     /// Brings the database, or the files in `data`, up to this version's schema.
-    pub async fn migrate(&self, data: &Path) -> anyhow::Result<Vec<Migrated>> {
-        match self.postgres()? {
-            Some(config) => Ok(midshift_store::migrate_postgres(&config).await?),
-            None => Ok(midshift_store::migrate(data).await?),
-        }
+    pub fn migrate<'a>(&'a self, data: &'a Path) -> Boxed<'a, anyhow::Result<Vec<Migrated>>> {
+        Box::pin(async move {
+            match self.postgres()? {
+                Some(config) => Ok(midshift_store::migrate_postgres(&config).await?),
+                None => Ok(midshift_store::migrate(data).await?),
+            }
+        })
     }
 
     /// Opens what is kept of `site_id`.
-    pub async fn open(&self, data: &Path, site_id: SiteId, clock: Arc<dyn Clock>) -> anyhow::Result<Storage> {
-        match self.postgres()? {
-            Some(config) => {
-                let store = PostgresStore::open(&config, site_id.clone(), clock.clone()).await;
-                let store = store.context("opening the store in PostgreSQL")?;
-                let frames = PostgresFrames::open(&config, site_id.clone(), clock, FRAME_BYTES_DEFAULT).await;
-                let frames = frames.context("opening the samples in PostgreSQL")?;
-                let heard =
-                    PostgresHeard::open(&config, site_id).await.context("opening the heartbeats in PostgreSQL")?;
-                Ok(Storage::Postgres(Arc::new(store), Arc::new(frames), Arc::new(heard)))
+    pub fn open<'a>(
+        &'a self,
+        data: &'a Path,
+        site_id: SiteId,
+        clock: Arc<dyn Clock>,
+    ) -> Boxed<'a, anyhow::Result<Storage>> {
+        Box::pin(async move {
+            match self.postgres()? {
+                Some(config) => {
+                    let store = PostgresStore::open(&config, site_id.clone(), clock.clone()).await;
+                    let store = store.context("opening the store in PostgreSQL")?;
+                    let frames = PostgresFrames::open(&config, site_id.clone(), clock, FRAME_BYTES_DEFAULT).await;
+                    let frames = frames.context("opening the samples in PostgreSQL")?;
+                    let heard =
+                        PostgresHeard::open(&config, site_id).await.context("opening the heartbeats in PostgreSQL")?;
+                    Ok(Storage::Postgres(Arc::new(store), Arc::new(frames), Arc::new(heard)))
+                }
+                None => {
+                    let store = SqliteStore::open(data, site_id.clone(), clock.clone()).await?;
+                    let frames = SqliteFrames::open(data, site_id, clock, FRAME_BYTES_DEFAULT).await?;
+                    Ok(Storage::Sqlite(Arc::new(store), Arc::new(frames)))
+                }
             }
-            None => {
-                let store = SqliteStore::open(data, site_id.clone(), clock.clone()).await?;
-                let frames = SqliteFrames::open(data, site_id, clock, FRAME_BYTES_DEFAULT).await?;
-                Ok(Storage::Sqlite(Arc::new(store), Arc::new(frames)))
-            }
-        }
+        })
     }
 }
 
@@ -122,18 +132,20 @@ impl Storage {
     }
 
     /// Finishes what is queued and closes everything.
-    pub async fn close(&self) {
-        match self {
-            Self::Sqlite(store, frames) => {
-                store.close().await;
-                frames.close().await;
+    pub fn close(&self) -> Boxed<'_, ()> {
+        Box::pin(async move {
+            match self {
+                Self::Sqlite(store, frames) => {
+                    store.close().await;
+                    frames.close().await;
+                }
+                Self::Postgres(store, frames, heard) => {
+                    heard.close().await;
+                    store.close().await;
+                    frames.close().await;
+                }
             }
-            Self::Postgres(store, frames, heard) => {
-                heard.close().await;
-                store.close().await;
-                frames.close().await;
-            }
-        }
+        })
     }
 }
 

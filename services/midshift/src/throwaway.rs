@@ -7,6 +7,7 @@ use midshift_agent::trust::Trust;
 use midshift_bundle::folder::Folder;
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::repository::Profile;
+use midshift_core::Boxed;
 use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::time::Clock;
@@ -24,15 +25,17 @@ pub struct Throwaway {
 
 impl Throwaway {
     /// Makes keys and the first root, and the service that has the online keys.
-    pub async fn make(clock: Arc<dyn Clock>) -> anyhow::Result<(Self, OtaService)> {
-        let this = Self { dir: tempfile::tempdir().context("making a folder for software")? };
-        Folder::create(&this.repository(), &this.keys(), Profile::Solo, clock.now().wall)?;
-        // No databases lie beside it that would need the rest of the disk.
-        let room = Room::of(limits::SOFTWARE_BYTES_DEFAULT);
-        let parts =
-            Parts { folder: this.dir.path().join("server"), keys: this.keys(), room, clock, owner: Owner::Nobody };
-        let service = OtaService::open(parts).await.context("opening software of robots")?;
-        Ok((this, service))
+    pub fn make(clock: Arc<dyn Clock>) -> Boxed<'static, anyhow::Result<(Self, OtaService)>> {
+        Box::pin(async move {
+            let this = Self { dir: tempfile::tempdir().context("making a folder for software")? };
+            Folder::create(&this.repository(), &this.keys(), Profile::Solo, clock.now().wall)?;
+            // No databases lie beside it that would need the rest of the disk.
+            let room = Room::of(limits::SOFTWARE_BYTES_DEFAULT);
+            let parts =
+                Parts { folder: this.dir.path().join("server"), keys: this.keys(), room, clock, owner: Owner::Nobody };
+            let service = OtaService::open(parts).await.context("opening software of robots")?;
+            Ok((this, service))
+        })
     }
     /// Where bundles are signed into and pushed from.
     pub fn repository(&self) -> PathBuf {

@@ -38,10 +38,11 @@ use collect::{Collector, Named};
 use content::{Content, DiskContent, Room, Sharing};
 use folder::{Gate, Owner, Presence};
 use hatch::Hatch;
+use midshift_core::Boxed;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::time::{Clock, Utc};
-use midshift_proto::ota::v1::bundle_service_server::BundleServiceServer;
+use midshift_proto::ota::v1::bundle_service_server::{BundleService, BundleServiceServer};
 use midshift_proto::ota::v1::chunk_service_server::ChunkServiceServer;
 use midshift_store::{Store, StoreId};
 use repository::{Documents, Error, OnlineKeys, Repository};
@@ -53,6 +54,7 @@ use tokio::runtime::RuntimeFlavor;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding;
+use tonic::service::Routes;
 
 /// How often the age of what was signed is looked at. By the wall, which may jump: so not once in half a day.
 const LOOK_EVERY: Duration = Duration::from_secs(60);
@@ -104,8 +106,10 @@ impl OtaService {
     /// # Errors
     /// If the folder is another store's, or another process works in it that wants to be alone; if keys, files or documents cannot be read,
     /// or documents do not hang together.
-    pub async fn open(parts: Parts) -> Result<Self, Error> {
-        let Parts { folder, keys, room, clock, owner } = parts;
+    pub fn open(parts: Parts) -> Boxed<'static, Result<Self, Error>> {
+        Box::pin(Self::opening(parts))
+    }
+    async fn opening(Parts { folder, keys, room, clock, owner }: Parts) -> Result<Self, Error> {
         let keys = blocking(move || OnlineKeys::read(&keys)).await?;
         let presence = Presence::come(&folder, &owner).await?;
         let sharing = presence.as_ref().filter(|_| matches!(owner, Owner::Shared { .. }));
@@ -151,17 +155,13 @@ impl OtaService {
     pub fn with_rows(self, rows: Arc<dyn Store>) -> Self {
         Self { rows: Some(rows), ..self }
     }
-    /// Releases, for people and programs.
-    pub fn bundles(&self) -> BundleServiceServer<Self> {
-        BundleServiceServer::new(self.clone())
-            .accept_compressed(CompressionEncoding::Gzip)
-            .max_decoding_message_size(MESSAGE_BYTES)
+    /// With releases, for people and programs.
+    pub fn add_bundles_to(&self, routes: Routes) -> Routes {
+        add_bundles(self.clone(), routes)
     }
-    /// Bytes, for robots.
-    pub fn chunks(&self) -> ChunkServiceServer<Hatch> {
-        ChunkServiceServer::new(self.hatch())
-            .accept_compressed(CompressionEncoding::Gzip)
-            .max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES)
+    /// With bytes, for robots.
+    pub fn add_chunks_to(&self, routes: Routes) -> Routes {
+        add_chunks(self.hatch(), routes)
     }
     /// `/metadata/…` and `/targets/…` over plain HTTP, for clients of TUF that are not ours.
     pub fn pages(&self) -> axum::Router {
@@ -172,18 +172,20 @@ impl OtaService {
         hatch.with_rows(self.rows.clone())
     }
     /// Keeps what was signed fresh, and takes away what nobody needs, until shutdown.
-    pub async fn run(self, shutdown: CancellationToken) {
-        let collecting = async {
-            if let Some(opened) = &self.opened {
-                opened.keep_room(&shutdown).await;
-            }
-        };
-        let following = async {
-            if let Some(opened) = &self.opened {
-                opened.follow(&shutdown).await;
-            }
-        };
-        tokio::join!(self.keep_fresh(&shutdown), collecting, following);
+    pub fn run(self, shutdown: CancellationToken) -> Boxed<'static, ()> {
+        Box::pin(async move {
+            let collecting = async {
+                if let Some(opened) = &self.opened {
+                    opened.keep_room(&shutdown).await;
+                }
+            };
+            let following = async {
+                if let Some(opened) = &self.opened {
+                    opened.follow(&shutdown).await;
+                }
+            };
+            tokio::join!(self.keep_fresh(&shutdown), collecting, following);
+        })
     }
     async fn keep_fresh(&self, shutdown: &CancellationToken) {
         let Some(opened) = &self.opened else { return shutdown.cancelled().await };
@@ -221,38 +223,42 @@ impl OtaReader {
     ///
     /// # Errors
     /// If it is not there, does not say that it is this store's, or documents do not hang together.
-    pub async fn open(folder: PathBuf, store_id: StoreId) -> Result<Self, Error> {
-        let of = folder.clone();
-        blocking(move || folder::must_be_of(&of, &store_id)).await?;
-        let content: Arc<dyn Content> = Arc::new(DiskContent::reading(&folder.join("content")));
-        let documents = Documents::reading(&folder.join("metadata"), content.clone()).await?;
-        Ok(Self { hatch: Hatch::new(content, documents.clone()), documents })
+    pub fn open(folder: PathBuf, store_id: StoreId) -> Boxed<'static, Result<Self, Error>> {
+        Box::pin(async move {
+            let of = folder.clone();
+            blocking(move || folder::must_be_of(&of, &store_id)).await?;
+            let content: Arc<dyn Content> = Arc::new(DiskContent::reading(&folder.join("content")));
+            let documents = Documents::reading(&folder.join("metadata"), content.clone()).await?;
+            Ok(Self { hatch: Hatch::new(content, documents.clone()), documents })
+        })
     }
     /// The same, which gives bytes to machines alone that these rows know as robots.
     #[must_use]
     pub fn with_rows(self, rows: Arc<dyn Store>) -> Self {
         Self { hatch: self.hatch.with_rows(Some(rows)), ..self }
     }
-    /// Documents, for robots: nothing else of releases is answered here.
-    pub fn bundles(&self) -> BundleServiceServer<Hatch> {
-        BundleServiceServer::new(self.hatch.clone())
-            .accept_compressed(CompressionEncoding::Gzip)
-            .max_decoding_message_size(MESSAGE_BYTES)
-    }
-    /// Bytes, for robots.
-    pub fn chunks(&self) -> ChunkServiceServer<Hatch> {
-        ChunkServiceServer::new(self.hatch.clone())
-            .accept_compressed(CompressionEncoding::Gzip)
-            .max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES)
+    /// With bytes and documents, for robots: nothing else of releases is answered here.
+    pub fn add_to(&self, routes: Routes) -> Routes {
+        add_bundles(self.hatch.clone(), add_chunks(self.hatch.clone(), routes))
     }
     /// `/metadata/…` and `/targets/…` over plain HTTP, for clients of TUF that are not ours.
     pub fn pages(&self) -> axum::Router {
         http1::router(self.hatch.clone())
     }
     /// Learns what others publish until shutdown.
-    pub async fn run(self, shutdown: CancellationToken) {
-        every_second(&shutdown, || self.documents.follow_if_possible()).await;
+    pub fn run(self, shutdown: CancellationToken) -> Boxed<'static, ()> {
+        Box::pin(async move { every_second(&shutdown, || self.documents.follow_if_possible()).await })
     }
+}
+
+fn add_bundles(face: impl BundleService, routes: Routes) -> Routes {
+    let face = BundleServiceServer::new(face).accept_compressed(CompressionEncoding::Gzip);
+    routes.add_service(face.max_decoding_message_size(MESSAGE_BYTES))
+}
+
+fn add_chunks(hatch: Hatch, routes: Routes) -> Routes {
+    let face = ChunkServiceServer::new(hatch).accept_compressed(CompressionEncoding::Gzip);
+    routes.add_service(face.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
 }
 
 /// Follows what other processes publish.

@@ -23,6 +23,7 @@ use midshift_bundle::keys::{self, SecretKey};
 use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::{self as people, FileTarget, Online, TIMESTAMP_LIFE_MS, listed};
 use midshift_bundle::ways::Way;
+use midshift_core::Boxed;
 use midshift_core::identity::{Actor, TokenId};
 use midshift_core::reason::Refusal;
 use midshift_core::time::{Clock, Doubt, Utc};
@@ -264,8 +265,8 @@ impl Repository {
     ///
     /// # Errors
     /// If it cannot be read, or what is there does not hang together.
-    pub async fn open(folder: &Path, keys: OnlineKeys, content: Arc<dyn Content>) -> Result<Self, Error> {
-        Self::opened(folder, keys, content, None).await
+    pub fn open(folder: &Path, keys: OnlineKeys, content: Arc<dyn Content>) -> Boxed<'_, Result<Self, Error>> {
+        Box::pin(async move { Self::opened(folder, keys, content, None).await })
     }
 
     /// As [`Repository::open`], for a folder in which other processes sign too: all that have a file at `lock` take turns.
@@ -385,45 +386,53 @@ impl Repository {
     ///
     /// # Errors
     /// Why not; nothing has changed then, or nobody knows and the next start does.
-    pub async fn publish(
+    pub fn publish(
         &self,
         roots: Vec<Vec<u8>>,
         targets: Vec<u8>,
         expected: u64,
         act: Act,
-    ) -> Result<Arc<Newest>, Error> {
-        let (writing, before) = self.turn().await?;
-        let newest = before.as_ref().map_or(0, |b| b.targets.edition.version);
-        if newest != expected {
-            return match before {
-                Some(before) if before.targets.bytes == targets && self.has_all(&before, &roots).await? => Ok(before),
-                _ => Err(Error::Moved { newest, expected }),
-            };
-        }
-        let publication = self.prepare(before.as_deref(), roots, targets, act).await?;
-        self.commit(writing, publication).await
+    ) -> Boxed<'_, Result<Arc<Newest>, Error>> {
+        Box::pin(async move {
+            let (writing, before) = self.turn().await?;
+            let newest = before.as_ref().map_or(0, |b| b.targets.edition.version);
+            if newest != expected {
+                return match before {
+                    Some(before) if before.targets.bytes == targets && self.has_all(&before, &roots).await? => {
+                        Ok(before)
+                    }
+                    _ => Err(Error::Moved { newest, expected }),
+                };
+            }
+            let publication = self.prepare(before.as_deref(), roots, targets, act).await?;
+            self.commit(writing, publication).await
+        })
     }
 
     /// Signs anew that everything is as it was, if that was said long ago. How long until it is due, ms; none: there is nothing to say.
     ///
     /// # Errors
     /// Why it was not signed.
-    pub async fn freshen(&self, now: Utc) -> Result<Option<u64>, Error> {
-        let (writing, before) = self.turn().await?;
-        let Some(before) = before else { return Ok(None) };
-        let issued = before.stamp.issued;
-        let age_ms = now.ms_since(issued);
-        // A clock that went back says nothing of the age.
-        if now >= issued && age_ms < FRESHEN_AFTER_MS && before.stamp.version >= self.floor {
-            return Ok(Some(FRESHEN_AFTER_MS - age_ms));
-        }
-        let (online, stamp) = self.sign(Some(&before), &before.root, &before.targets.bytes, now)?;
-        let writes =
-            vec![(file(stamp.snapshot_version, "snapshot"), online.snapshot), (TIMESTAMP.to_owned(), online.timestamp)];
-        let timestamp = writes[1].1.clone();
-        let newest = Newest { stamp, timestamp, ..(*before).clone() };
-        self.commit(writing, Publication { writes, newest }).await?;
-        Ok(Some(FRESHEN_AFTER_MS))
+    pub fn freshen(&self, now: Utc) -> Boxed<'_, Result<Option<u64>, Error>> {
+        Box::pin(async move {
+            let (writing, before) = self.turn().await?;
+            let Some(before) = before else { return Ok(None) };
+            let issued = before.stamp.issued;
+            let age_ms = now.ms_since(issued);
+            // A clock that went back says nothing of the age.
+            if now >= issued && age_ms < FRESHEN_AFTER_MS && before.stamp.version >= self.floor {
+                return Ok(Some(FRESHEN_AFTER_MS - age_ms));
+            }
+            let (online, stamp) = self.sign(Some(&before), &before.root, &before.targets.bytes, now)?;
+            let writes = vec![
+                (file(stamp.snapshot_version, "snapshot"), online.snapshot),
+                (TIMESTAMP.to_owned(), online.timestamp),
+            ];
+            let timestamp = writes[1].1.clone();
+            let newest = Newest { stamp, timestamp, ..(*before).clone() };
+            self.commit(writing, Publication { writes, newest }).await?;
+            Ok(Some(FRESHEN_AFTER_MS))
+        })
     }
 
     /// What it says now, and that it says nothing else as long as the turn lasts.

@@ -7,6 +7,7 @@
 //!
 //! Called by the binary now and then.
 
+use midshift_core::Boxed;
 use midshift_core::ids::BundleId;
 use midshift_core::limits;
 use midshift_core::privacy;
@@ -24,15 +25,17 @@ const ROBOTS_AT_ONCE: usize = limits::ITEM_ROWS_MAX - 1;
 ///
 /// # Errors
 /// If the store does not answer.
-pub async fn prune(store: &dyn Store, clock: &dyn Clock) -> Result<u64, Error> {
+pub fn prune<'a>(store: &'a dyn Store, clock: &dyn Clock) -> Boxed<'a, Result<u64, Error>> {
     let now = clock.now();
-    let keys = match privacy::retention_of(Table::OtaCommandKey).before(now.steady_wall()) {
-        Some(before) => aged::take_away(store, Table::OtaCommandKey, before.0, "command.forgotten").await?,
-        None => 0,
-    };
-    let rollouts = prune_rollouts(store).await?;
-    let bundles = prune_bundles(store, &now).await?;
-    Ok(keys + rollouts + bundles + aged::forget_robots(store, Writer::Ota, now.steady_utc()).await?)
+    Box::pin(async move {
+        let keys = match privacy::retention_of(Table::OtaCommandKey).before(now.steady_wall()) {
+            Some(before) => aged::take_away(store, Table::OtaCommandKey, before.0, "command.forgotten").await?,
+            None => 0,
+        };
+        let rollouts = prune_rollouts(store).await?;
+        let bundles = prune_bundles(store, &now).await?;
+        Ok(keys + rollouts + bundles + aged::forget_robots(store, Writer::Ota, now.steady_utc()).await?)
+    })
 }
 
 /// Of roll-outs that have ended the newest stay.

@@ -2,9 +2,9 @@
 //!
 //! A stop goes to all robots as it was encoded once. Invariant: the wire is that of `stop_link_service.proto`; a generated client cannot tell.
 
+use crate::Inner;
 use crate::line;
 use crate::outbox::Down;
-use crate::{Inner, StopService};
 use bytes::{BufMut, Bytes};
 use midshift_core::limits;
 use midshift_proto::access::caller;
@@ -25,14 +25,7 @@ const BUFFER: (usize, usize) = (512, 32 * 1024);
 
 /// `midshift.stop.v1.StopLinkService`. Cheap to clone.
 #[derive(Clone)]
-pub struct LinkFace(Arc<Inner>);
-
-impl StopService {
-    /// The robots' face.
-    pub fn link(&self) -> LinkFace {
-        LinkFace(self.inner.clone())
-    }
-}
+pub(crate) struct LinkFace(pub Arc<Inner>);
 
 struct Ready;
 struct AsIs;

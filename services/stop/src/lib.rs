@@ -3,7 +3,7 @@
 //! An operational stop request: not a safety function, no performance level. The independent emergency stop is the hardware of the robot's maker and
 //! integrator, whose state midshift shows and never replaces; midshift is not suitable as part of a safety system.
 //!
-//! Called by the binary: [`StopService::open`], its gRPC faces or [`StopService::routes`], [`StopService::run`] and [`serve`]. Invariant: nothing of the store, the task
+//! Called by the binary: [`StopService::open`], [`StopService::routes`], [`StopService::run`] and [`serve`]. Invariant: nothing of the store, the task
 //! queue or another service lies on its way; an engage waits for no robot, and for the disk only with its answer; a folder without its memory, or one that
 //! cannot be read, begins with the fleet stopped. Absent on purpose: who may come in: that is the port's, and is told here only so that it can be recorded.
 
@@ -26,15 +26,16 @@ mod robots;
 mod snapshot;
 mod status;
 
-pub use face::LinkFace;
 pub use first::{FIRST, announce_first_start, withdraw_first_start};
 pub use holder::{HOLDER, NotEnded, end_holder, is_held};
 pub use snapshot::{Copied, Principals, Roster};
 
 use audit::{Action, Broken, Note, Verified};
 use disk::{Disk, Writer};
+use face::LinkFace;
 use ground::Ground;
 use law::{Kept, Law};
+use midshift_core::Boxed;
 use midshift_core::identity::Actor;
 use midshift_core::ids::SiteId;
 use midshift_core::limits;
@@ -203,11 +204,12 @@ impl StopService {
         Ok(Self { inner, folder, writer: Arc::new(Mutex::new(Some(opened.writer))) })
     }
 
-    /// The people's and programs' face.
-    pub fn grpc(&self) -> StopServiceServer<Self> {
-        StopServiceServer::new(self.clone())
-            .accept_compressed(CompressionEncoding::Gzip)
-            .max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES)
+    /// With both faces, that of people and programs and that of robots.
+    pub fn add_to(&self, routes: Routes) -> Routes {
+        let face = StopServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip);
+        routes
+            .add_service(face.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
+            .add_service(LinkFace(self.inner.clone()))
     }
 
     /// Stops that are engaged now.
@@ -219,26 +221,25 @@ impl StopService {
     ///
     /// # Errors
     /// The descriptors cannot be read: a fault of the build.
-    pub async fn routes(&self) -> Result<Routes, Error> {
-        let reflection = || {
-            let names = ["midshift.stop.v1.StopService", "midshift.stop.v1.StopLinkService", "grpc.health.v1.Health"];
-            let builder = tonic_reflection::server::Builder::configure()
-                .register_encoded_file_descriptor_set(midshift_proto::FILE_DESCRIPTOR_SET)
-                .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
-                .register_encoded_file_descriptor_set(tonic_types::pb::FILE_DESCRIPTOR_SET);
-            names.into_iter().fold(builder, |builder, name| builder.with_service_name(name))
-        };
-        let (health, health_service) = tonic_health::server::health_reporter();
-        health.set_serving::<StopServiceServer<Self>>().await;
-        health.set_serving::<LinkFace>().await;
-        let mut routes = Routes::builder();
-        routes
-            .add_service(health_service.max_decoding_message_size(limits::HEALTH_MESSAGE_BYTES))
-            .add_service(reflection().build_v1()?.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
-            .add_service(reflection().build_v1alpha()?.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
-            .add_service(self.grpc())
-            .add_service(self.link());
-        Ok(routes.routes())
+    pub fn routes(&self) -> Boxed<'_, Result<Routes, Error>> {
+        Box::pin(async move {
+            let reflection = || {
+                let names =
+                    ["midshift.stop.v1.StopService", "midshift.stop.v1.StopLinkService", "grpc.health.v1.Health"];
+                let builder = tonic_reflection::server::Builder::configure()
+                    .register_encoded_file_descriptor_set(midshift_proto::FILE_DESCRIPTOR_SET)
+                    .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+                    .register_encoded_file_descriptor_set(tonic_types::pb::FILE_DESCRIPTOR_SET);
+                names.into_iter().fold(builder, |builder, name| builder.with_service_name(name))
+            };
+            let (health, health_service) = tonic_health::server::health_reporter();
+            health.set_serving::<StopServiceServer<Self>>().await;
+            health.set_serving::<LinkFace>().await;
+            let routes = Routes::new(health_service.max_decoding_message_size(limits::HEALTH_MESSAGE_BYTES))
+                .add_service(reflection().build_v1()?.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
+                .add_service(reflection().build_v1alpha()?.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES));
+            Ok(self.add_to(routes))
+        })
     }
 
     /// Shows when who is known was last written down, or said to be so still, as the port follows it. The first one counts.
@@ -272,24 +273,26 @@ impl StopService {
 
     /// Records that another process is ready to follow this one, and ends. False: the disk does not hold that, or not all that is engaged and reset, so that this one
     /// goes on.
-    pub async fn is_followed(&self) -> bool {
-        let inner = &self.inner;
-        if !inner.disk.record(Note::own(inner.clock.now().wall, Action::Followed)).await {
-            return false;
-        }
-        // What comes in between waits for the disk, and whoever asked for it for this service.
-        for _ in 0..FOLLOW_TRIES {
-            let version = lock(&inner.law).version();
-            if !inner.disk.turn(version).await {
+    pub fn is_followed(&self) -> Boxed<'_, bool> {
+        Box::pin(async move {
+            let inner = &self.inner;
+            if !inner.disk.record(Note::own(inner.clock.now().wall, Action::Followed)).await {
                 return false;
             }
-            let _fan = lock(&inner.fan);
-            if inner.disk.holds(lock(&inner.law).version()) {
-                inner.shutdown.cancel();
-                return true;
+            // What comes in between waits for the disk, and whoever asked for it for this service.
+            for _ in 0..FOLLOW_TRIES {
+                let version = lock(&inner.law).version();
+                if !inner.disk.turn(version).await {
+                    return false;
+                }
+                let _fan = lock(&inner.fan);
+                if inner.disk.holds(lock(&inner.law).version()) {
+                    inner.shutdown.cancel();
+                    return true;
+                }
             }
-        }
-        false
+            false
+        })
     }
 
     /// When its lines have ended, so that its port may close.
@@ -302,26 +305,28 @@ impl StopService {
     ///
     /// # Errors
     /// A part ended by itself, or it was called before.
-    pub async fn run(self) -> Result<(), Error> {
-        let inner = self.inner;
-        let Some(writer) = lock(&self.writer).take() else { return Err(Error::Ended) };
-        let (shutdown, ended) = (inner.shutdown.clone(), inner.ended.clone());
-        let _end = ended.clone().drop_guard();
-        let moving = async {
-            shutdown.cancelled().await;
-            let now = inner.clock.now().link;
-            // A line that begins now sees that it is too late, or is among these.
-            let _fan = lock(&inner.fan);
-            inner.robots.lines().iter().for_each(|line| line.finish(now));
-        };
-        let following = async {
-            tokio::select! {
-                () = shutdown.cancelled() => {}
-                () = snapshot::follow_files(&inner, self.folder.clone()) => {}
-            }
-        };
-        tokio::join!(disk::keep(&inner, writer), moving, following);
-        Ok(())
+    pub fn run(self) -> Boxed<'static, Result<(), Error>> {
+        Box::pin(async move {
+            let inner = self.inner;
+            let Some(writer) = lock(&self.writer).take() else { return Err(Error::Ended) };
+            let (shutdown, ended) = (inner.shutdown.clone(), inner.ended.clone());
+            let _end = ended.clone().drop_guard();
+            let moving = async {
+                shutdown.cancelled().await;
+                let now = inner.clock.now().link;
+                // A line that begins now sees that it is too late, or is among these.
+                let _fan = lock(&inner.fan);
+                inner.robots.lines().iter().for_each(|line| line.finish(now));
+            };
+            let following = async {
+                tokio::select! {
+                    () = shutdown.cancelled() => {}
+                    () = snapshot::follow_files(&inner, self.folder.clone()) => {}
+                }
+            };
+            tokio::join!(disk::keep(&inner, writer), moving, following);
+            Ok(())
+        })
     }
 }
 

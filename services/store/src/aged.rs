@@ -3,6 +3,7 @@
 //! Invariant: oldest first, in small items that others' commits pass between; of two processes that do so at once one does it.
 
 use crate::{CommitError, Error, Query, Store};
+use midshift_core::Boxed;
 use midshift_core::fleet::rows::{RobotAuthority, RobotControl, RobotHolder};
 use midshift_core::limits;
 use midshift_core::robot::Presence;
@@ -18,19 +19,26 @@ const SLICE: usize = 200;
 ///
 /// # Errors
 /// If the store cannot be read or written; what is left goes another time.
-pub async fn take_away(store: &dyn Store, table: Table, before_unix_ms: i64, kind: &'static str) -> Result<u64, Error> {
-    let mut gone = 0;
-    loop {
-        let rows = store.list(Query { limit: SLICE, ..Query::all(table) }).await?;
-        let mut item = Item::new(table.writer(), table.writer().as_str());
-        for row in rows.into_iter().take_while(|row| row.index.order.is_some_and(|at| at < before_unix_ms)) {
-            item.delete(row.key, row.revision, kind);
+pub fn take_away<'a>(
+    store: &'a dyn Store,
+    table: Table,
+    before_unix_ms: i64,
+    kind: &'static str,
+) -> Boxed<'a, Result<u64, Error>> {
+    Box::pin(async move {
+        let mut gone = 0;
+        loop {
+            let rows = store.list(Query { limit: SLICE, ..Query::all(table) }).await?;
+            let mut item = Item::new(table.writer(), table.writer().as_str());
+            for row in rows.into_iter().take_while(|row| row.index.order.is_some_and(|at| at < before_unix_ms)) {
+                item.delete(row.key, row.revision, kind);
+            }
+            match commit(store, item).await? {
+                0 => return Ok(gone),
+                slice => gone += slice,
+            }
         }
-        match commit(store, item).await? {
-            0 => return Ok(gone),
-            slice => gone += slice,
-        }
-    }
+    })
 }
 
 /// Takes away what `writer` keeps of robots that were retired more than [`limits::GONE_KEPT`] ago, that nobody hears and that nothing holds.
@@ -38,14 +46,16 @@ pub async fn take_away(store: &dyn Store, table: Table, before_unix_ms: i64, kin
 ///
 /// # Errors
 /// If the store cannot be read or written; what is left goes another time.
-pub async fn forget_robots(store: &dyn Store, writer: Writer, now: Utc) -> Result<u64, Error> {
-    let mut gone = 0;
-    for row in store.snapshot(&[Table::RobotControl]).await?.rows {
-        if row.decode::<RobotControl>().is_ok_and(|control| is_gone(&control, now)) {
-            gone += forget_robot(store, writer, row).await?;
+pub fn forget_robots(store: &dyn Store, writer: Writer, now: Utc) -> Boxed<'_, Result<u64, Error>> {
+    Box::pin(async move {
+        let mut gone = 0;
+        for row in store.snapshot(&[Table::RobotControl]).await?.rows {
+            if row.decode::<RobotControl>().is_ok_and(|control| is_gone(&control, now)) {
+                gone += forget_robot(store, writer, row).await?;
+            }
         }
-    }
-    Ok(gone)
+        Ok(gone)
+    })
 }
 
 /// Whether the robot was retired so long ago that its rows go.

@@ -8,6 +8,7 @@
 
 use crate::{Error, LiveBoard, Store};
 use async_trait::async_trait;
+use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
 use midshift_core::rows::Seq;
 use midshift_core::time::Clock;
@@ -61,18 +62,20 @@ impl From<&Live> for Heard {
 
 /// Brings what gateways hear onto the board of this process, until it is dropped. A heartbeat counts as processed when it is read, which is
 /// never before its gateway had it. What was heard before this began is passed over: whoever is there is heard again within a second.
-pub async fn follow_heard(log: Arc<dyn HeardLog>, board: Arc<LiveBoard<Live>>, clock: Arc<dyn Clock>) {
-    let mut position = None;
-    loop {
-        match look(log.as_ref(), position, &board, clock.as_ref()).await {
-            Ok(read) => {
-                position = Some(read);
-                board.set_read_up_to(read);
+pub fn follow_heard(log: Arc<dyn HeardLog>, board: Arc<LiveBoard<Live>>, clock: Arc<dyn Clock>) -> Boxed<'static, ()> {
+    Box::pin(async move {
+        let mut position = None;
+        loop {
+            match look(log.as_ref(), position, &board, clock.as_ref()).await {
+                Ok(read) => {
+                    position = Some(read);
+                    board.set_read_up_to(read);
+                }
+                Err(error) => tracing::debug!(%error, "others' heartbeats cannot be read, trying again"),
             }
-            Err(error) => tracing::debug!(%error, "others' heartbeats cannot be read, trying again"),
+            tokio::time::sleep(LOOK_EVERY).await;
         }
-        tokio::time::sleep(LOOK_EVERY).await;
-    }
+    })
 }
 
 async fn look(

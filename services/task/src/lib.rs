@@ -17,6 +17,8 @@ mod rows;
 mod search;
 mod watch;
 
+use midshift_core::Boxed;
+use midshift_core::limits;
 use midshift_core::reason::Refusal;
 use midshift_core::rows::{Item, Table};
 use midshift_core::site::Site;
@@ -30,6 +32,7 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding;
+use tonic::service::Routes;
 
 /// What the service is built from.
 pub struct Parts {
@@ -63,19 +66,22 @@ impl TaskService {
     ///
     /// # Errors
     /// If the store cannot be read.
-    pub async fn open(parts: Parts, shutdown: CancellationToken) -> Result<Self, Error> {
-        let query = Query { newest_first: true, limit: 1, ..Query::all(Table::TaskIntake) };
-        let newest = parts.store.list(query).await?.pop();
-        let number = match newest {
-            Some(row) => row.decode::<TaskIntake>()?.number,
-            None => 0,
-        };
-        let number = AtomicU64::new(number);
-        Ok(Self { inner: Arc::new(Inner { parts, number, salt: rand::random(), shutdown }) })
+    pub fn open(parts: Parts, shutdown: CancellationToken) -> Boxed<'static, Result<Self, Error>> {
+        Box::pin(async move {
+            let query = Query { newest_first: true, limit: 1, ..Query::all(Table::TaskIntake) };
+            let newest = parts.store.list(query).await?.pop();
+            let number = match newest {
+                Some(row) => row.decode::<TaskIntake>()?.number,
+                None => 0,
+            };
+            let number = AtomicU64::new(number);
+            Ok(Self { inner: Arc::new(Inner { parts, number, salt: rand::random(), shutdown }) })
+        })
     }
-    /// The gRPC face.
-    pub fn grpc(&self) -> TaskServiceServer<Self> {
-        TaskServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
+    /// With the gRPC face.
+    pub fn add_to(&self, routes: Routes) -> Routes {
+        let face = TaskServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip);
+        routes.add_service(face.max_decoding_message_size(limits::TASK_MESSAGE_BYTES))
     }
     fn store(&self) -> &dyn Store {
         self.inner.parts.store.as_ref()

@@ -4,6 +4,7 @@
 //! that is sent again after its row has gone is a new request.
 
 use crate::TaskService;
+use midshift_core::Boxed;
 use midshift_core::limits;
 use midshift_core::privacy;
 use midshift_core::rows::{Item, Key, Row, Table, Writer};
@@ -21,14 +22,16 @@ impl TaskService {
     ///
     /// # Errors
     /// If the store cannot be read or written; what is left goes another time.
-    pub async fn prune(&self) -> Result<u64, Error> {
-        let (mut gone, now) = (0, self.inner.parts.clock.now().steady_wall());
-        for (table, kind) in KEPT {
-            if let Some(before) = privacy::retention_of(table).before(now) {
-                gone += aged::take_away(self.store(), table, before.0, kind).await?;
+    pub fn prune(&self) -> Boxed<'_, Result<u64, Error>> {
+        Box::pin(async {
+            let (mut gone, now) = (0, self.inner.parts.clock.now().steady_wall());
+            for (table, kind) in KEPT {
+                if let Some(before) = privacy::retention_of(table).before(now) {
+                    gone += aged::take_away(self.store(), table, before.0, kind).await?;
+                }
             }
-        }
-        Ok(gone + self.prune_intakes().await?)
+            Ok(gone + self.prune_intakes().await?)
+        })
     }
 
     /// What was asked for goes after its task: fleet takes the state of a task away when it ended long ago.

@@ -170,9 +170,7 @@ fn fact(robot_id: &RobotId, entry: &InboxEntry) -> Fact {
         (InboxItem::Sample(_), _) => "robot.event",
     };
     metrics::counter!("midshift_telemetry_facts_total", "kind" => kind).increment(1);
-    // An inbox entry holds only plain data, which serde_json cannot fail to write.
-    let body = serde_json::to_string(entry).map_or_else(|e| unreachable!("entry is not JSON: {e}"), Arc::from);
-    Fact { log: Log::RobotInbox, subject: Arc::from(robot_id.as_str()), kind, body }
+    Fact { log: Log::RobotInbox, subject: Arc::from(robot_id.as_str()), kind, body: entry.text() }
 }
 
 /// What came of a commit.

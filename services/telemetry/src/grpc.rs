@@ -171,7 +171,7 @@ impl TelemetryService {
             .entries
             .iter()
             .filter_map(|entry| {
-                let said: InboxEntry = serde_json::from_str(entry.body.as_ref()?).ok()?;
+                let said = InboxEntry::parse(entry.body.as_ref()?).ok()?;
                 let about = r.subject.is_empty() || subject(&said).is_some_and(|s| s == r.subject);
                 let is_seen = |robot_id: &RobotId| sees(&self.inner, by, robot_id);
                 let is_seen = *seen.entry(said.robot_id.clone()).or_insert_with_key(is_seen);

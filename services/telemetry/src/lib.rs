@@ -32,6 +32,7 @@ pub use retention::prune;
 
 use midshift_core::time::Clock;
 use midshift_core::work::Live;
+use midshift_core::{Boxed, limits};
 use midshift_proto::link::v1::link_service_server::LinkServiceServer;
 use midshift_proto::link::v1::replay_service_server::ReplayServiceServer;
 use midshift_proto::telemetry::v1::telemetry_service_server::TelemetryServiceServer;
@@ -42,6 +43,7 @@ use std::sync::Arc;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding;
+use tonic::service::Routes;
 
 /// What the service is built from.
 pub struct Parts {
@@ -86,27 +88,21 @@ impl TelemetryService {
     pub fn new(parts: Parts, shutdown: CancellationToken) -> Self {
         let (picture, registry, ear) = (Picture::default(), Registry::default(), ear::Ear::default());
         let shared = parts.heard.clone().map(shared::Shared::new);
-        let hellos = Arc::new(Semaphore::new(midshift_core::limits::HELLOS_MAX));
+        let hellos = Arc::new(Semaphore::new(limits::HELLOS_MAX));
         let (event_rates, moving) = (event_rate::EventRates::default(), CancellationToken::new());
         let misreads = misreads::Misreads::default();
         let inner = Inner { parts, picture, registry, event_rates, misreads, ear, shared, hellos, moving, shutdown };
         Self { inner: Arc::new(inner) }
     }
-    /// The robots' face.
-    pub fn link(&self) -> LinkServiceServer<Self> {
-        LinkServiceServer::new(self.clone())
-            .accept_compressed(CompressionEncoding::Gzip)
-            .max_decoding_message_size(midshift_core::limits::TELEMETRY_BATCH_BYTES)
-    }
-    /// The robots' face beside their sessions, for old STATUS.
-    pub fn replay(&self) -> ReplayServiceServer<Self> {
-        ReplayServiceServer::new(self.clone())
-            .accept_compressed(CompressionEncoding::Gzip)
-            .max_decoding_message_size(midshift_core::limits::TELEMETRY_BATCH_BYTES)
-    }
-    /// The people's and programs' face.
-    pub fn grpc(&self) -> TelemetryServiceServer<Self> {
-        TelemetryServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
+    /// With the faces of robots, that of their sessions and the one beside them for old STATUS, and with that of people and programs.
+    pub fn add_to(&self, routes: Routes) -> Routes {
+        let link = LinkServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip);
+        let replay = ReplayServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip);
+        let face = TelemetryServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip);
+        routes
+            .add_service(face.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
+            .add_service(link.max_decoding_message_size(limits::TELEMETRY_BATCH_BYTES))
+            .add_service(replay.max_decoding_message_size(limits::TELEMETRY_BATCH_BYTES))
     }
     /// Whether the database that several processes share has not been reached for long, so that no session is held here; it may come back.
     /// None: this process needs nobody else.
@@ -118,26 +114,32 @@ impl TelemetryService {
         self.inner.registry.in_charge()
     }
     /// Takes no new sessions and asks every robot to open its next one elsewhere; returns when none is left.
-    pub async fn move_over(&self) {
-        self.inner.moving.cancel();
-        self.inner.registry.empty().await;
+    pub fn move_over(&self) -> Boxed<'_, ()> {
+        Box::pin(async {
+            self.inner.moving.cancel();
+            self.inner.registry.empty().await;
+        })
     }
     /// Listens for the beacons of launchers on `socket` until shutdown: hints for people, which nobody proves and nothing is decided by.
-    pub async fn hear(self, socket: tokio::net::UdpSocket) {
+    pub fn hear(self, socket: tokio::net::UdpSocket) -> Boxed<'static, ()> {
         let inner = self.inner;
-        tokio::select! {
-            () = inner.shutdown.cancelled() => {}
-            () = ear::listen(&inner, &socket) => {}
-        }
+        Box::pin(async move {
+            tokio::select! {
+                () = inner.shutdown.cancelled() => {}
+                () = ear::listen(&inner, &socket) => {}
+            }
+        })
     }
     /// Keeps the picture of rows and the presence of robots until shutdown.
-    pub async fn run(self) -> Result<(), Error> {
+    pub fn run(self) -> Boxed<'static, Result<(), Error>> {
         let inner = self.inner;
-        tokio::select! {
-            () = inner.shutdown.cancelled() => Ok(()),
-            result = picture::keep(&inner) => result,
-            () = presence::keep(&inner) => Ok(()),
-            () = shared::keep(&inner) => Ok(()),
-        }
+        Box::pin(async move {
+            tokio::select! {
+                () = inner.shutdown.cancelled() => Ok(()),
+                result = picture::keep(&inner) => result,
+                () = presence::keep(&inner) => Ok(()),
+                () = shared::keep(&inner) => Ok(()),
+            }
+        })
     }
 }

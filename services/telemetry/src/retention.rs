@@ -3,6 +3,7 @@
 //! Invariant: the marks of the ring that a robot's newest session has stay, however old they are: they guard the inbox and say what of STATUS need
 //! not come again. Called by the binary now and then.
 
+use midshift_core::Boxed;
 use midshift_core::limits;
 use midshift_core::rows::{Item, Record, Row, Table, Writer};
 use midshift_core::time::{Clock, Utc};
@@ -14,11 +15,13 @@ use std::collections::{BTreeMap, BTreeSet};
 ///
 /// # Errors
 /// If the store or the log of frames does not answer.
-pub async fn prune(store: &dyn Store, frames: &dyn FrameLog, clock: &dyn Clock) -> Result<u64, Error> {
+pub fn prune<'a>(store: &'a dyn Store, frames: &'a dyn FrameLog, clock: &dyn Clock) -> Boxed<'a, Result<u64, Error>> {
     let now = clock.now();
-    let rows = prune_marks(store, now.steady_wall()).await?
-        + aged::forget_robots(store, Writer::Telemetry, now.steady_utc()).await?;
-    Ok(rows + prune_frame_marks(store, frames).await?)
+    Box::pin(async move {
+        let rows = prune_marks(store, now.steady_wall()).await?
+            + aged::forget_robots(store, Writer::Telemetry, now.steady_utc()).await?;
+        Ok(rows + prune_frame_marks(store, frames).await?)
+    })
 }
 
 async fn prune_marks(store: &dyn Store, wall: Utc) -> Result<u64, Error> {

@@ -50,6 +50,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::io::InspectReader;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::AbortOnDropHandle;
+use tonic::service::Routes;
 use tonic::transport::{Channel, Endpoint, Server, Uri};
 use tonic::{Request, Response, Status, Streaming};
 
@@ -177,9 +178,7 @@ impl Bench {
         let (ends, incoming) = mpsc::channel(4);
         let (seen, sessions) = mpsc::channel(4);
         let server = Server::builder()
-            .add_service(LinkServiceServer::new(Desk(seen)))
-            .add_service(ota.bundles())
-            .add_service(ota.chunks())
+            .add_routes(ota.add_chunks_to(ota.add_bundles_to(Routes::new(LinkServiceServer::new(Desk(seen))))))
             .serve_with_incoming(ReceiverStream::new(incoming));
         let server = AbortOnDropHandle::new(tokio::spawn(server));
         let endpoint = dial::endpoint("http://server")?;

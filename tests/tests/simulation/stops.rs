@@ -20,7 +20,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
-use tonic::service::InterceptorLayer;
+use tonic::service::{InterceptorLayer, Routes};
 use tonic::transport::Server;
 use tonic::{Request, Status};
 
@@ -120,8 +120,7 @@ async fn live(folder: PathBuf, site: Arc<Site>, time: TrueTime, wire: Wire) -> t
                 });
                 let port = Server::builder()
                     .layer(everybody)
-                    .add_service(service.grpc())
-                    .add_service(service.link())
+                    .add_routes(service.add_to(Routes::default()))
                     .serve_with_incoming_shutdown(incoming, drained);
                 midshift_stop::serve(service, port).await??;
             }

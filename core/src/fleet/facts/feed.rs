@@ -35,7 +35,7 @@ pub fn absorb(view: &mut View, now: Now, board: &Board, entries: &[Entry], plan:
             continue;
         }
         match (entry.log, entry.table, &entry.body) {
-            (Log::RobotInbox, None, Some(body)) => match serde_json::from_str::<InboxEntry>(body) {
+            (Log::RobotInbox, None, Some(body)) => match InboxEntry::parse(body) {
                 Ok(said) => {
                     let mut tally = plan.report.tally;
                     let is_obeyed = plan.decide(view, now, said.robot_id.as_str(), |tx| {

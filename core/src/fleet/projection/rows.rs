@@ -4,7 +4,7 @@ use super::command::Command;
 use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, RolloutId, SiteId, StopId, TaskId};
 use crate::reason::Reason;
 use crate::robot::{Duty, Inventory};
-use crate::rows::{Index, Record, Seq, Table};
+use crate::rows::{Index, Record, Seq, Table, body_is_json};
 use crate::time::Utc;
 use crate::work::WorkStats;
 use serde::{Deserialize, Serialize};
@@ -69,6 +69,7 @@ impl Place {
 
 impl Record for Place {
     const TABLE: Table = Table::PlaceGrant;
+    body_is_json!();
     fn id(&self) -> String {
         self.place_id.to_string()
     }
@@ -98,6 +99,7 @@ pub struct RobotAuthority {
 
 impl Record for RobotAuthority {
     const TABLE: Table = Table::RobotAuthority;
+    body_is_json!();
     fn id(&self) -> String {
         self.robot_id.to_string()
     }
@@ -211,6 +213,7 @@ impl RobotControl {
 
 impl Record for RobotControl {
     const TABLE: Table = Table::RobotControl;
+    body_is_json!();
     fn id(&self) -> String {
         self.robot_id.to_string()
     }
@@ -274,6 +277,7 @@ impl Timer {
 
 impl Record for Timer {
     const TABLE: Table = Table::Timer;
+    body_is_json!();
     fn id(&self) -> String {
         Self::id_of(self.kind, &self.attempt)
     }
@@ -303,6 +307,7 @@ impl HoldToken {
 
 impl Record for HoldToken {
     const TABLE: Table = Table::HoldToken;
+    body_is_json!();
     fn id(&self) -> String {
         Self::id_of(&self.robot_id, &self.token)
     }
@@ -336,6 +341,7 @@ pub struct RobotCounter {
 
 impl Record for RobotCounter {
     const TABLE: Table = Table::RobotCounter;
+    body_is_json!();
     fn id(&self) -> String {
         format!("{}@{}", self.robot_id, self.software)
     }
@@ -357,6 +363,7 @@ pub struct SiteRow {
 
 impl Record for SiteRow {
     const TABLE: Table = Table::Site;
+    body_is_json!();
     fn id(&self) -> String {
         self.site_id.to_string()
     }
@@ -373,6 +380,7 @@ pub struct ServiceClock {
 
 impl Record for ServiceClock {
     const TABLE: Table = Table::ServiceClock;
+    body_is_json!();
     fn id(&self) -> String {
         "fleet".to_owned()
     }
@@ -387,6 +395,7 @@ pub struct FleetMark {
 
 impl Record for FleetMark {
     const TABLE: Table = Table::FleetMark;
+    body_is_json!();
     fn id(&self) -> String {
         "fleet".to_owned()
     }
@@ -425,6 +434,7 @@ pub struct Closed {
 
 impl Record for Incident {
     const TABLE: Table = Table::Incident;
+    body_is_json!();
     fn id(&self) -> String {
         self.id.clone()
     }
@@ -505,6 +515,7 @@ pub struct AreaBudget {
 
 impl Record for AreaBudget {
     const TABLE: Table = Table::AreaBudget;
+    body_is_json!();
     fn id(&self) -> String {
         self.area_id.to_string()
     }
@@ -512,6 +523,7 @@ impl Record for AreaBudget {
 
 impl Record for Drain {
     const TABLE: Table = Table::Drain;
+    body_is_json!();
     fn id(&self) -> String {
         self.drain_id.to_string()
     }

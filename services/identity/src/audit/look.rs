@@ -69,7 +69,7 @@ impl Behind {
             self.at = 0;
         }
         // What cannot be read is no row to show; `verify` names it.
-        self.ahead.extend(rows.iter().filter_map(|row| serde_json::from_str::<AuditRow>(&row.body).ok()));
+        self.ahead.extend(rows.iter().filter_map(|row| AuditRow::read(&row.body)));
         if self.ahead.is_empty() {
             self.at = rows.last().and_then(|row| row.index.order).unwrap_or(0).max(0).cast_unsigned();
         }

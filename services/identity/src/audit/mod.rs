@@ -9,6 +9,7 @@ mod look;
 pub mod upkeep;
 mod verify;
 
+use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Row, Table};
 use midshift_core::time::Clock;
@@ -18,6 +19,7 @@ use std::sync::Arc;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding;
+use tonic::service::Routes;
 
 /// Exports and verifications at a time: each reads everything there is.
 const READERS_MAX: usize = 4;
@@ -36,9 +38,10 @@ impl AuditService {
     pub fn new(store: Arc<dyn Store>, clock: Arc<dyn Clock>, shutdown: CancellationToken) -> Self {
         Self { store, clock, readers: Arc::new(Semaphore::new(READERS_MAX)), shutdown }
     }
-    /// The gRPC face.
-    pub fn grpc(&self) -> AuditServiceServer<Self> {
-        AuditServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
+    /// With the gRPC face.
+    pub fn add_to(&self, routes: Routes) -> Routes {
+        let face = AuditServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip);
+        routes.add_service(face.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
     }
 }
 

@@ -2,6 +2,7 @@
 //!
 //! Invariant: whatever is quoted was committed before the quote. Called by the binary, for the services that its process has.
 
+use midshift_core::Boxed;
 use midshift_core::audit::{Head, Kind, Note, open};
 use midshift_core::limits;
 use midshift_core::privacy;
@@ -17,7 +18,11 @@ const SLICES_MAX: usize = 20;
 ///
 /// # Errors
 /// If the store cannot be read or written; what is left is done another time.
-pub async fn maintain_chain(store: &dyn Store, clock: &dyn Clock, writer: Writer) -> Result<(), Error> {
+pub fn maintain_chain<'a>(store: &'a dyn Store, clock: &'a dyn Clock, writer: Writer) -> Boxed<'a, Result<(), Error>> {
+    Box::pin(maintain(store, clock, writer))
+}
+
+async fn maintain(store: &dyn Store, clock: &dyn Clock, writer: Writer) -> Result<(), Error> {
     let Some(table) = Table::audit_of(writer) else { return Ok(()) };
     let now = clock.now().wall.0;
     let newest = Query { newest_first: true, limit: 1, ..Query::all(table).in_states([Kind::Anchor.number()]) };
@@ -39,7 +44,7 @@ pub async fn maintain_chain(store: &dyn Store, clock: &dyn Clock, writer: Writer
 }
 
 fn at(row: &Row) -> Option<i64> {
-    serde_json::from_str::<midshift_core::audit::AuditRow>(&row.body).ok().map(|row| row.at_unix_ms)
+    midshift_core::audit::AuditRow::read(&row.body).map(|row| row.at_unix_ms)
 }
 
 fn head(row: &Row) -> Option<Head> {

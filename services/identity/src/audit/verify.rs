@@ -131,7 +131,7 @@ impl AuditService {
         };
         let newest = || Query { newest_first: true, ..Query::all(table) };
         let n = |row: Option<Row>| row.and_then(|row| row.index.order).unwrap_or(0).max(0).cast_unsigned();
-        let at = |row: Row| serde_json::from_str::<AuditRow>(&row.body).ok().map(|row| row.at_unix_ms);
+        let at = |row: Row| AuditRow::read(&row.body).map(|row| row.at_unix_ms);
         Ok(Ends {
             first: n(one(Query::all(table)).await?),
             last: n(one(newest()).await?),

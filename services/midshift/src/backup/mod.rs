@@ -21,6 +21,7 @@ pub use access::{Access, Identity, Settled};
 use anyhow::{Context, bail, ensure};
 use files::write;
 use midshift_bundle::digest::Digest;
+use midshift_core::Boxed;
 use midshift_core::time::Utc;
 use midshift_store::{PostgresConfig, PostgresRestore, RestoreError, StoreId};
 pub use part::KEYS;
@@ -90,54 +91,59 @@ pub struct Summary {
 ///
 /// # Errors
 /// If something cannot be read or written. Nothing is left at `to` then.
-pub async fn back_up(from: &Places, to: &Path, now: Utc) -> anyhow::Result<Summary> {
-    let place = Place::new(to)?;
-    let mut names = Vec::new();
-    let mut said = Said::default();
-    for part in PARTS {
-        let folder = place.path().join(part.name());
-        let copied = part.copy(from, &folder, &mut said).await;
-        if copied.with_context(|| format!("copying {}", part.name()))? {
-            names.push(part.name().to_owned());
+pub fn back_up<'a>(from: &'a Places, to: &'a Path, now: Utc) -> Boxed<'a, anyhow::Result<Summary>> {
+    Box::pin(async move {
+        let place = Place::new(to)?;
+        let mut names = Vec::new();
+        let mut said = Said::default();
+        for part in PARTS {
+            let folder = place.path().join(part.name());
+            let copied = part.copy(from, &folder, &mut said).await;
+            if copied.with_context(|| format!("copying {}", part.name()))? {
+                names.push(part.name().to_owned());
+            }
         }
-    }
-    let site_id = said.site_id.with_context(|| format!("no server ever served from {}", from.data.display()))?;
-    let root = place.path().to_owned();
-    let files = blocking(move || listed(&root)).await?;
-    let midshift = env!("CARGO_PKG_VERSION").to_owned();
-    let list = List { format: FORMAT, midshift, site_id, begun_unix_ms: now.0, parts: names, files };
-    write(&place.path().join(LIST), &serde_json::to_vec_pretty(&list)?)?;
-    place.name(to).await?;
-    Ok(list.summary())
+        let site_id = said.site_id.with_context(|| format!("no server ever served from {}", from.data.display()))?;
+        let root = place.path().to_owned();
+        let files = blocking(move || listed(&root)).await?;
+        let midshift = env!("CARGO_PKG_VERSION").to_owned();
+        let list = List { format: FORMAT, midshift, site_id, begun_unix_ms: now.0, parts: names, files };
+        write(&place.path().join(LIST), &serde_json::to_vec_pretty(&list)?)?;
+        place.name(to).await?;
+        Ok(list.summary())
+    })
 }
 
 /// Whether everything of a backup is there, is what its list says, and hangs together. Changes nothing.
 ///
 /// # Errors
 /// With everything that is wrong with it.
-pub async fn verify(backup: &Path) -> anyhow::Result<Summary> {
-    let path = backup.join(LIST);
-    let bytes = fs::read(&path).with_context(|| format!("{} is no backup: reading {LIST}", backup.display()))?;
-    let list: List = serde_json::from_slice(&bytes).with_context(|| format!("{} is not readable", path.display()))?;
-    ensure!(list.format == FORMAT, "the backup has format {}, this release knows {FORMAT}", list.format);
-    let root = backup.to_owned();
-    let found = blocking(move || listed(&root)).await?;
-    let mut wrong = differences(&list.files, &found);
-    for name in &list.parts {
-        let Some(part) = PARTS.iter().find(|part| part.name() == name) else {
-            wrong.push(format!("this release knows no part {name}"));
-            continue;
-        };
-        let folder = backup.join(name);
-        match part.check(&folder).await {
-            Ok(found) => wrong.extend(found.into_iter().map(|text| format!("{name}: {text}"))),
-            Err(error) => wrong.push(format!("{name}: {error:#}")),
+pub fn verify(backup: &Path) -> Boxed<'_, anyhow::Result<Summary>> {
+    Box::pin(async move {
+        let path = backup.join(LIST);
+        let bytes = fs::read(&path).with_context(|| format!("{} is no backup: reading {LIST}", backup.display()))?;
+        let list: List =
+            serde_json::from_slice(&bytes).with_context(|| format!("{} is not readable", path.display()))?;
+        ensure!(list.format == FORMAT, "the backup has format {}, this release knows {FORMAT}", list.format);
+        let root = backup.to_owned();
+        let found = blocking(move || listed(&root)).await?;
+        let mut wrong = differences(&list.files, &found);
+        for name in &list.parts {
+            let Some(part) = PARTS.iter().find(|part| part.name() == name) else {
+                wrong.push(format!("this release knows no part {name}"));
+                continue;
+            };
+            let folder = backup.join(name);
+            match part.check(&folder).await {
+                Ok(found) => wrong.extend(found.into_iter().map(|text| format!("{name}: {text}"))),
+                Err(error) => wrong.push(format!("{name}: {error:#}")),
+            }
         }
-    }
-    if !wrong.is_empty() {
-        bail!("the backup is not good: {}", wrong.join("; "));
-    }
-    Ok(list.summary())
+        if !wrong.is_empty() {
+            bail!("the backup is not good: {}", wrong.join("; "));
+        }
+        Ok(list.summary())
+    })
 }
 
 /// Makes a data directory of a backup, which is verified first, and where its rows are of PostgreSQL an empty database. Neither `to.data`
@@ -146,42 +152,49 @@ pub async fn verify(backup: &Path) -> anyhow::Result<Summary> {
 /// # Errors
 /// If the backup is not good or of the other engine, the clock is before it, the database is not empty, or something cannot be written.
 /// Nothing is left at `to` then, unless the database went silent at its last word: the error says so, and what to do.
-pub async fn restore(backup: &Path, to: &Places, access: &Access, now: Utc) -> anyhow::Result<(Summary, Settled)> {
-    let revocations = access.list()?;
-    let summary = verify(backup).await?;
-    match (summary.has(POSTGRES), &to.store) {
-        (true, None) => bail!(
-            "the backup has rows of PostgreSQL and no database is named: add --store; it cannot become files of SQLite"
-        ),
-        (false, Some(_)) => bail!(
-            "the backup has rows of SQLite and cannot go into PostgreSQL: restore it without --store, with MIDSHIFT_STORE unset"
-        ),
-        _ => {}
-    }
-    ensure!(now >= summary.begun, "this machine's clock is before the moment of the backup; set it first");
-    let place = Place::new(&to.data)?;
-    // Keys that do not go into the data directory are made whole beside their own place.
-    let mut keys = None;
-    let mut within = Places { data: place.path().to_owned(), ota_keys: None, store: to.store.clone() };
-    if let Some(folder) = &to.ota_keys {
-        ensure!(summary.has(KEYS), "the backup has no online keys");
-        within.ota_keys = Some(match folder.strip_prefix(&to.data) {
-            Ok(inside) => place.path().join(inside),
-            Err(_) => keys.insert((Place::new(folder)?, folder.clone())).0.path().to_owned(),
-        });
-    }
-    let mut making = Making { places: within, store_id: StoreId::fresh(), now, rows: None };
-    for part in PARTS.iter().rev().filter(|part| summary.has(part.name())) {
-        let put_back = part.put_back(&backup.join(part.name()), &mut making).await;
-        put_back.with_context(|| format!("restoring {}", part.name()))?;
-        // Before a database waits for its last word.
-        place.sync().await?;
-    }
-    let settled =
-        access.put_right(&revocations, &summary.site_id, &mut making).await.context("restoring who is known")?;
-    let places = keys.into_iter().chain([(place, to.data.clone())]);
-    name_all(places, making.rows).await?;
-    Ok((summary, settled))
+pub fn restore<'a>(
+    backup: &'a Path,
+    to: &'a Places,
+    access: &'a Access,
+    now: Utc,
+) -> Boxed<'a, anyhow::Result<(Summary, Settled)>> {
+    Box::pin(async move {
+        let revocations = access.list()?;
+        let summary = verify(backup).await?;
+        match (summary.has(POSTGRES), &to.store) {
+            (true, None) => bail!(
+                "the backup has rows of PostgreSQL and no database is named: add --store; it cannot become files of SQLite"
+            ),
+            (false, Some(_)) => bail!(
+                "the backup has rows of SQLite and cannot go into PostgreSQL: restore it without --store, with MIDSHIFT_STORE unset"
+            ),
+            _ => {}
+        }
+        ensure!(now >= summary.begun, "this machine's clock is before the moment of the backup; set it first");
+        let place = Place::new(&to.data)?;
+        // Keys that do not go into the data directory are made whole beside their own place.
+        let mut keys = None;
+        let mut within = Places { data: place.path().to_owned(), ota_keys: None, store: to.store.clone() };
+        if let Some(folder) = &to.ota_keys {
+            ensure!(summary.has(KEYS), "the backup has no online keys");
+            within.ota_keys = Some(match folder.strip_prefix(&to.data) {
+                Ok(inside) => place.path().join(inside),
+                Err(_) => keys.insert((Place::new(folder)?, folder.clone())).0.path().to_owned(),
+            });
+        }
+        let mut making = Making { places: within, store_id: StoreId::fresh(), now, rows: None };
+        for part in PARTS.iter().rev().filter(|part| summary.has(part.name())) {
+            let put_back = part.put_back(&backup.join(part.name()), &mut making).await;
+            put_back.with_context(|| format!("restoring {}", part.name()))?;
+            // Before a database waits for its last word.
+            place.sync().await?;
+        }
+        let settled =
+            access.put_right(&revocations, &summary.site_id, &mut making).await.context("restoring who is known")?;
+        let places = keys.into_iter().chain([(place, to.data.clone())]);
+        name_all(places, making.rows).await?;
+        Ok((summary, settled))
+    })
 }
 
 /// Gives folders their names and commits the rows last: they alone make a server of it, and a folder without them belongs to no store.

@@ -67,7 +67,7 @@ async fn a_session_on_an_old_connection_moves_over_and_the_next_one_is_in_charge
     let parts = midshift_telemetry::Parts { store, frames, board, heard: None, clock: clock(), bugs };
     let telemetry = TelemetryService::new(parts, stop.clone());
     tokio::spawn(telemetry.clone().run());
-    let address = port(Routes::new(telemetry.link()), stop.clone()).await;
+    let address = port(telemetry.add_to(Routes::default()), stop.clone()).await;
     let mut previous = None;
     for _ in 0..5 {
         let (welcome, mut down, _up) = session(address, previous).await;

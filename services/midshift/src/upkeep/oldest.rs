@@ -89,7 +89,7 @@ async fn first_of_chain(store: &dyn Store, table: Table) -> Result<Option<i64>, 
 }
 
 fn written(row: &Row) -> Option<i64> {
-    serde_json::from_str::<AuditRow>(&row.body).ok().map(|row| row.at_unix_ms)
+    AuditRow::read(&row.body).map(|row| row.at_unix_ms)
 }
 
 async fn first_entry(store: &dyn Store, log: Log) -> Result<Option<i64>, Error> {

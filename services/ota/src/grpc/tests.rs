@@ -13,7 +13,7 @@ use midshift_proto::ota::v1::chunk_service_client::ChunkServiceClient;
 use midshift_proto::refusal_of;
 use tempfile::TempDir;
 use tokio_stream::wrappers::TcpListenerStream;
-use tonic::service::InterceptorLayer;
+use tonic::service::{InterceptorLayer, Routes};
 use tonic::transport::{Channel, Endpoint, Server};
 use tonic::{Request, Status};
 
@@ -32,7 +32,8 @@ async fn served(dir: TempDir, service: OtaService) -> World {
         request.extensions_mut().insert(Caller::local());
         Ok::<_, Status>(request)
     });
-    let server = Server::builder().layer(port).add_service(service.bundles()).add_service(service.chunks());
+    let routes = service.add_chunks_to(service.add_bundles_to(Routes::default()));
+    let server = Server::builder().layer(port).add_routes(routes);
     tokio::spawn(server.serve_with_incoming(TcpListenerStream::new(listener)));
     let channel = Endpoint::from_shared(format!("http://{address}")).expect("a uri").connect_lazy();
     let bundles = BundleServiceClient::new(channel.clone()).max_decoding_message_size(16 * 1024 * 1024);

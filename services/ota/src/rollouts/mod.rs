@@ -18,8 +18,10 @@ pub use directives::Signer;
 pub use releases::known_bundles;
 
 use crate::OtaService;
+use midshift_core::Boxed;
 use midshift_core::identity::Caller;
 use midshift_core::ids::RolloutId;
+use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::bugs::Bugs;
@@ -36,6 +38,7 @@ use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot, watch as channel};
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding;
+use tonic::service::Routes;
 
 /// Requests that may wait for the planner; one more is told to come back.
 const REQUESTS_MAX: usize = 256;
@@ -122,9 +125,10 @@ impl RolloutService {
     pub fn with_probation(self, probation_ms: u64) -> Self {
         Self { probation_ms, ..self }
     }
-    /// The gRPC face.
-    pub fn grpc(&self) -> RolloutServiceServer<Self> {
-        RolloutServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip)
+    /// With the gRPC face.
+    pub fn add_to(&self, routes: Routes) -> Routes {
+        let face = RolloutServiceServer::new(self.clone()).accept_compressed(CompressionEncoding::Gzip);
+        routes.add_service(face.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
     }
     async fn send(&self, request: Request) -> Result<(), Refusal> {
         self.ota.opened()?;
@@ -182,7 +186,7 @@ impl Planner {
     ///
     /// # Errors
     /// Never by itself; the caller's services end alike.
-    pub async fn run(self, shutdown: CancellationToken) -> Result<(), midshift_store::Error> {
-        reconcile::run(self, shutdown).await
+    pub fn run(self, shutdown: CancellationToken) -> Boxed<'static, Result<(), midshift_store::Error>> {
+        Box::pin(reconcile::run(self, shutdown))
     }
 }

@@ -11,6 +11,7 @@ use crate::migrations::TELEMETRY;
 use crate::queue::unavailable;
 use crate::{Coarsen, Error, Frame, FrameLog, FrameMark, FramesOldest, Gap, OpenError, StoredFrame, sql};
 use async_trait::async_trait;
+use midshift_core::Boxed;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::time::Clock;
 use sqlx::{PgPool, Row};
@@ -29,27 +30,31 @@ impl PostgresFrames {
     ///
     /// # Errors
     /// If the database cannot be reached, is newer than this binary, or cannot be durable.
-    pub async fn open(
+    pub fn open(
         config: &PostgresConfig,
         site_id: SiteId,
         clock: Arc<dyn Clock>,
         bytes_max: u64,
-    ) -> Result<Self, OpenError> {
-        let database = Database::new(config, TELEMETRY_SCHEMA)?;
-        let connection = database.writer().await?;
-        migrate::apply(&database, TELEMETRY, None).await?;
-        let readers = database.readers();
-        let writer = FramesWriter::open(database, connection, site_id.clone(), clock, bytes_max).await?;
-        let (commands, queue) = FramesQueue::new();
-        tokio::spawn(run(writer, queue));
-        Ok(Self { site_id, commands, readers })
+    ) -> Boxed<'_, Result<Self, OpenError>> {
+        Box::pin(async move {
+            let database = Database::new(config, TELEMETRY_SCHEMA)?;
+            let connection = database.writer().await?;
+            migrate::apply(&database, TELEMETRY, None).await?;
+            let readers = database.readers();
+            let writer = FramesWriter::open(database, connection, site_id.clone(), clock, bytes_max).await?;
+            let (commands, queue) = FramesQueue::new();
+            tokio::spawn(run(writer, queue));
+            Ok(Self { site_id, commands, readers })
+        })
     }
 
     /// Finishes what is queued and closes the connections. Everything asked afterwards is refused.
-    pub async fn close(&self) {
-        // An error means that it is closed already.
-        let _ = self.commands.ask(|reply| Command::Close { reply }).await;
-        self.readers.close().await;
+    pub fn close(&self) -> Boxed<'_, ()> {
+        Box::pin(async move {
+            // An error means that it is closed already.
+            let _ = self.commands.ask(|reply| Command::Close { reply }).await;
+            self.readers.close().await;
+        })
     }
 
     async fn page(&self, after: u64, bytes_max: usize) -> Result<Vec<StoredFrame>, sqlx::Error> {

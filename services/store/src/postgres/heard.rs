@@ -11,6 +11,7 @@ use super::writer::is_undone_by_others;
 use crate::queue::unavailable;
 use crate::{Error, Heard, HeardLog, Kept, OpenError};
 use async_trait::async_trait;
+use midshift_core::Boxed;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::rows::Silent;
 use sqlx::{PgConnection, PgPool, Row};
@@ -35,21 +36,27 @@ impl PostgresHeard {
     ///
     /// # Errors
     /// If the database cannot be reached.
-    pub async fn open(config: &PostgresConfig, site_id: SiteId) -> Result<Self, OpenError> {
-        let database = Database::new(config, super::CONTROL_SCHEMA)?;
-        let mut connection = database.writer().await?;
-        sqlx::query("INSERT INTO robot_last_head (site_id, position) VALUES ($1, 0) ON CONFLICT (site_id) DO NOTHING")
+    pub fn open(config: &PostgresConfig, site_id: SiteId) -> Boxed<'_, Result<Self, OpenError>> {
+        Box::pin(async move {
+            let database = Database::new(config, super::CONTROL_SCHEMA)?;
+            let mut connection = database.writer().await?;
+            sqlx::query(
+                "INSERT INTO robot_last_head (site_id, position) VALUES ($1, 0) ON CONFLICT (site_id) DO NOTHING",
+            )
             .bind(site_id.as_str())
             .execute(&mut connection)
             .await
             .map_err(|source| OpenError::Sql { doing: "reading the head of the heartbeats", source })?;
-        Ok(Self { readers: database.readers(), database, site_id, writer: Mutex::new(Some(connection)) })
+            Ok(Self { readers: database.readers(), database, site_id, writer: Mutex::new(Some(connection)) })
+        })
     }
 
     /// Closes its connections.
-    pub async fn close(&self) {
-        drop(self.writer.lock().await.take());
-        self.readers.close().await;
+    pub fn close(&self) -> Boxed<'_, ()> {
+        Box::pin(async move {
+            drop(self.writer.lock().await.take());
+            self.readers.close().await;
+        })
     }
 }
 

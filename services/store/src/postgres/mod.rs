@@ -28,6 +28,7 @@ use crate::{
 };
 use async_trait::async_trait;
 use connect::{Database, patiently};
+use midshift_core::Boxed;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Item, Key, Log, Naming, Part, Row, Seq, Writer as Author};
@@ -46,10 +47,12 @@ const TELEMETRY_SCHEMA: &str = "telemetry";
 ///
 /// # Errors
 /// If the database cannot be reached or is newer than this binary.
-pub async fn migrate_postgres(config: &PostgresConfig) -> Result<Vec<Migrated>, OpenError> {
-    let control = migrate::apply(&Database::new(config, CONTROL_SCHEMA)?, CONTROL, None).await?;
-    let telemetry = migrate::apply(&Database::new(config, TELEMETRY_SCHEMA)?, TELEMETRY, None).await?;
-    Ok(vec![control, telemetry])
+pub fn migrate_postgres(config: &PostgresConfig) -> Boxed<'_, Result<Vec<Migrated>, OpenError>> {
+    Box::pin(async move {
+        let control = migrate::apply(&Database::new(config, CONTROL_SCHEMA)?, CONTROL, None).await?;
+        let telemetry = migrate::apply(&Database::new(config, TELEMETRY_SCHEMA)?, TELEMETRY, None).await?;
+        Ok(vec![control, telemetry])
+    })
 }
 
 /// A [`Store`] in schema `control` of a PostgreSQL database.
@@ -69,39 +72,43 @@ impl PostgresStore {
     ///
     /// # Errors
     /// If the database cannot be reached, belongs to another site, is newer than this binary, or cannot be durable.
-    pub async fn open(config: &PostgresConfig, site_id: SiteId, clock: Arc<dyn Clock>) -> Result<Self, OpenError> {
-        let database = Database::new(config, CONTROL_SCHEMA)?;
-        let mut connection = database.writer().await?;
-        let migrated = migrate::apply(&database, CONTROL, Some((&site_id, clock.now().wall))).await?;
-        if !migrated.applied.is_empty() {
-            tracing::info!(schema = migrated.file, from = migrated.from, to = migrated.to, "schema migrated");
-        }
-        let id = writer::identify(&mut connection, &site_id, clock.now().wall).await?;
-        let head = read::head(&mut connection, &site_id)
-            .await
-            .map_err(|source| OpenError::Sql { doing: "reading the head", source })?;
-        let readers = database.readers();
-        let (wake_sender, wake) = watch::channel(head);
-        let (committed_sender, committed) = watch::channel(head);
-        let (commands, queue) = Queue::new();
-        let known = (site_id.clone(), id.clone());
-        let wakes = (wake_sender.clone(), committed_sender);
-        tokio::spawn(run(Writer::new(database.clone(), connection, known, clock, wakes), queue));
-        let sweep = wake::sweep(readers.clone(), site_id.clone(), wake_sender.clone());
-        let mut wakers = vec![tokio::spawn(sweep).abort_handle()];
-        if config.wakes == Wakes::Notified {
-            let listen = wake::listen(database.clone(), site_id.clone(), wake_sender);
-            wakers.push(tokio::spawn(listen).abort_handle());
-            wakers.push(tokio::spawn(wake::notify(database, site_id.clone(), committed)).abort_handle());
-        }
-        Ok(Self { id, site_id, commands, readers, wake, wakers })
+    pub fn open(config: &PostgresConfig, site_id: SiteId, clock: Arc<dyn Clock>) -> Boxed<'_, Result<Self, OpenError>> {
+        Box::pin(async move {
+            let database = Database::new(config, CONTROL_SCHEMA)?;
+            let mut connection = database.writer().await?;
+            let migrated = migrate::apply(&database, CONTROL, Some((&site_id, clock.now().wall))).await?;
+            if !migrated.applied.is_empty() {
+                tracing::info!(schema = migrated.file, from = migrated.from, to = migrated.to, "schema migrated");
+            }
+            let id = writer::identify(&mut connection, &site_id, clock.now().wall).await?;
+            let head = read::head(&mut connection, &site_id)
+                .await
+                .map_err(|source| OpenError::Sql { doing: "reading the head", source })?;
+            let readers = database.readers();
+            let (wake_sender, wake) = watch::channel(head);
+            let (committed_sender, committed) = watch::channel(head);
+            let (commands, queue) = Queue::new();
+            let known = (site_id.clone(), id.clone());
+            let wakes = (wake_sender.clone(), committed_sender);
+            tokio::spawn(run(Writer::new(database.clone(), connection, known, clock, wakes), queue));
+            let sweep = wake::sweep(readers.clone(), site_id.clone(), wake_sender.clone());
+            let mut wakers = vec![tokio::spawn(sweep).abort_handle()];
+            if config.wakes == Wakes::Notified {
+                let listen = wake::listen(database.clone(), site_id.clone(), wake_sender);
+                wakers.push(tokio::spawn(listen).abort_handle());
+                wakers.push(tokio::spawn(wake::notify(database, site_id.clone(), committed)).abort_handle());
+            }
+            Ok(Self { id, site_id, commands, readers, wake, wakers })
+        })
     }
 
     /// Finishes what is queued and closes the connections. Everything asked afterwards is refused.
-    pub async fn close(&self) {
-        self.commands.close().await;
-        self.wakers.iter().for_each(AbortHandle::abort);
-        self.readers.close().await;
+    pub fn close(&self) -> Boxed<'_, ()> {
+        Box::pin(async move {
+            self.commands.close().await;
+            self.wakers.iter().for_each(AbortHandle::abort);
+            self.readers.close().await;
+        })
     }
 
     async fn page(

@@ -8,6 +8,7 @@ use crate::StoreId;
 use crate::amend::amended;
 use crate::migrations::{self, Migration};
 use crate::sql::{self, RENEW};
+use midshift_core::Boxed;
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Item, Row as StoredRow, Seq, Table};
 use sqlx::sqlite::SqliteConnectOptions;
@@ -59,38 +60,42 @@ impl Database {
     ///
     /// # Errors
     /// If the file cannot be read, was written by a newer release, or the copy cannot be written.
-    pub async fn copy(self, dir: &Path, to: &Path) -> Result<(), OpenError> {
-        let mut connection = read_only(&dir.join(self.file())).await?;
-        self.schema(&mut connection).await?;
-        let sql = |source| OpenError::Sql { doing: "copying", source };
-        sqlx::query("VACUUM INTO $1").bind(to.to_string_lossy()).execute(&mut connection).await.map_err(sql)?;
-        connection.close().await.map_err(sql)?;
-        let durable = async { tokio::fs::File::open(to).await?.sync_all().await };
-        durable.await.map_err(|source| OpenError::Io { doing: "making the copy durable", source })
+    pub fn copy<'a>(self, dir: &'a Path, to: &'a Path) -> Boxed<'a, Result<(), OpenError>> {
+        Box::pin(async move {
+            let mut connection = read_only(&dir.join(self.file())).await?;
+            self.schema(&mut connection).await?;
+            let sql = |source| OpenError::Sql { doing: "copying", source };
+            sqlx::query("VACUUM INTO $1").bind(to.to_string_lossy()).execute(&mut connection).await.map_err(sql)?;
+            connection.close().await.map_err(sql)?;
+            let durable = async { tokio::fs::File::open(to).await?.sync_all().await };
+            durable.await.map_err(|source| OpenError::Io { doing: "making the copy durable", source })
+        })
     }
 
     /// Reads a file that nobody serves from, and whether SQLite finds it whole: what is wrong with it comes second.
     ///
     /// # Errors
     /// If it cannot be read at all, or was written by a newer release.
-    pub async fn inspect(self, path: &Path) -> Result<(Described, Vec<String>), OpenError> {
-        let mut connection = read_only(path).await?;
-        let sql = |source| OpenError::Sql { doing: "checking", source };
-        let schema = self.schema(&mut connection).await?;
-        let rows = sqlx::query("SELECT integrity_check FROM pragma_integrity_check LIMIT $1").bind(FINDINGS_MAX);
-        let rows = rows.fetch_all(&mut connection).await.map_err(sql)?;
-        let found: Result<Vec<String>, _> = rows.iter().map(|row| row.try_get(0)).collect();
-        let found = found.map_err(sql)?.into_iter().filter(|text| text != "ok").collect();
-        let mut described = Described { site_id: None, head: None, schema };
-        if self == Self::Control {
-            let head = sqlx::query("SELECT site_id, seq FROM store_head").fetch_optional(&mut connection).await;
-            if let Some(head) = head.map_err(sql)? {
-                described.site_id = Some(head.try_get(0).map_err(sql)?);
-                described.head = Some(Seq(head.try_get::<i64, _>(1).map_err(sql)?.cast_unsigned()));
+    pub fn inspect(self, path: &Path) -> Boxed<'_, Result<(Described, Vec<String>), OpenError>> {
+        Box::pin(async move {
+            let mut connection = read_only(path).await?;
+            let sql = |source| OpenError::Sql { doing: "checking", source };
+            let schema = self.schema(&mut connection).await?;
+            let rows = sqlx::query("SELECT integrity_check FROM pragma_integrity_check LIMIT $1").bind(FINDINGS_MAX);
+            let rows = rows.fetch_all(&mut connection).await.map_err(sql)?;
+            let found: Result<Vec<String>, _> = rows.iter().map(|row| row.try_get(0)).collect();
+            let found = found.map_err(sql)?.into_iter().filter(|text| text != "ok").collect();
+            let mut described = Described { site_id: None, head: None, schema };
+            if self == Self::Control {
+                let head = sqlx::query("SELECT site_id, seq FROM store_head").fetch_optional(&mut connection).await;
+                if let Some(head) = head.map_err(sql)? {
+                    described.site_id = Some(head.try_get(0).map_err(sql)?);
+                    described.head = Some(Seq(head.try_get::<i64, _>(1).map_err(sql)?.cast_unsigned()));
+                }
             }
-        }
-        connection.close().await.map_err(sql)?;
-        Ok((described, found))
+            connection.close().await.map_err(sql)?;
+            Ok((described, found))
+        })
     }
 
     async fn schema(self, connection: &mut SqliteConnection) -> Result<u32, OpenError> {
@@ -109,11 +114,13 @@ impl Database {
 ///
 /// # Errors
 /// If the file cannot be written.
-pub async fn renew_identity(dir: &Path, id: &StoreId) -> Result<(), OpenError> {
-    let sql = |source| OpenError::Sql { doing: "giving the restored store an id of its own", source };
-    let mut connection = durable(dir).await.map_err(sql)?;
-    sqlx::query(RENEW).bind(&*id.0).execute(&mut connection).await.map_err(sql)?;
-    connection.close().await.map_err(sql)
+pub fn renew_identity<'a>(dir: &'a Path, id: &'a StoreId) -> Boxed<'a, Result<(), OpenError>> {
+    Box::pin(async move {
+        let sql = |source| OpenError::Sql { doing: "giving the restored store an id of its own", source };
+        let mut connection = durable(dir).await.map_err(sql)?;
+        sqlx::query(RENEW).bind(&*id.0).execute(&mut connection).await.map_err(sql)?;
+        connection.close().await.map_err(sql)
+    })
 }
 
 /// A restored `control.db` that nobody serves from yet.
@@ -131,36 +138,42 @@ impl SqliteRestored {
     ///
     /// # Errors
     /// If the file cannot be written, or is of a newer release.
-    pub async fn open(dir: &Path, site_id: SiteId) -> Result<Self, OpenError> {
-        let mut connection = durable(dir).await.map_err(amending)?;
-        schema::apply(&mut connection, CONTROL_DB, migrations::CONTROL).await?;
-        Ok(Self { connection, site_id })
+    pub fn open(dir: &Path, site_id: SiteId) -> Boxed<'_, Result<Self, OpenError>> {
+        Box::pin(async move {
+            let mut connection = durable(dir).await.map_err(amending)?;
+            schema::apply(&mut connection, CONTROL_DB, migrations::CONTROL).await?;
+            Ok(Self { connection, site_id })
+        })
     }
 
     /// All rows of these tables.
     ///
     /// # Errors
     /// If the file cannot be read.
-    pub async fn rows(&mut self, tables: &[Table]) -> Result<Vec<StoredRow>, OpenError> {
-        let mut rows = Vec::new();
-        for table in tables {
-            let select = sqlx::query(AssertSqlSafe(sql::whole(*table))).bind(self.site_id.as_str());
-            for row in &select.fetch_all(&mut self.connection).await.map_err(amending)? {
-                rows.push(sql::row(*table, row).map_err(amending)?);
+    pub fn rows<'a>(&'a mut self, tables: &'a [Table]) -> Boxed<'a, Result<Vec<StoredRow>, OpenError>> {
+        Box::pin(async move {
+            let mut rows = Vec::new();
+            for table in tables {
+                let select = sqlx::query(AssertSqlSafe(sql::whole(*table))).bind(self.site_id.as_str());
+                for row in &select.fetch_all(&mut self.connection).await.map_err(amending)? {
+                    rows.push(sql::row(*table, row).map_err(amending)?);
+                }
             }
-        }
-        Ok(rows)
+            Ok(rows)
+        })
     }
 
     /// Writes rows of an item, all or none, and closes the file. No log has them: the restored store is another one, which everybody reads anew.
     ///
     /// # Errors
     /// If the file cannot be written.
-    pub async fn amend(mut self, item: &Item) -> Result<(), OpenError> {
-        let mut transaction = self.connection.begin().await.map_err(amending)?;
-        write_sql::rows(&mut transaction, &self.site_id, &amended(item)).await.map_err(amending)?;
-        transaction.commit().await.map_err(amending)?;
-        self.connection.close().await.map_err(amending)
+    pub fn amend(mut self, item: &Item) -> Boxed<'_, Result<(), OpenError>> {
+        Box::pin(async move {
+            let mut transaction = self.connection.begin().await.map_err(amending)?;
+            write_sql::rows(&mut transaction, &self.site_id, &amended(item)).await.map_err(amending)?;
+            transaction.commit().await.map_err(amending)?;
+            self.connection.close().await.map_err(amending)
+        })
     }
 }
 

@@ -11,6 +11,7 @@ use crate::migrations::TELEMETRY;
 use crate::queue::unavailable;
 use crate::{Coarsen, Error, Frame, FrameLog, FrameMark, FramesOldest, Gap, OpenError, StoredFrame, sql};
 use async_trait::async_trait;
+use midshift_core::Boxed;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::time::Clock;
 use sqlx::{Row, SqlitePool};
@@ -31,25 +32,34 @@ impl SqliteFrames {
     ///
     /// # Errors
     /// If another server has the directory, the file is newer than this binary, or cannot be durable.
-    pub async fn open(dir: &Path, site_id: SiteId, clock: Arc<dyn Clock>, bytes_max: u64) -> Result<Self, OpenError> {
-        let (file, _) = DataFile::open(dir, TELEMETRY_DB, TELEMETRY).await?;
-        let readers = file.readers().await?;
-        let writer = FramesWriter::open(file.clone(), site_id.clone(), clock, bytes_max).await?;
-        let (commands, queue) = FramesQueue::new();
-        let (ended_sender, ended) = oneshot::channel();
-        tokio::spawn(async move {
-            run(writer, queue).await;
-            drop(ended_sender);
-        });
-        tokio::spawn(file.checkpoint(ended));
-        Ok(Self { site_id, commands, readers })
+    pub fn open(
+        dir: &Path,
+        site_id: SiteId,
+        clock: Arc<dyn Clock>,
+        bytes_max: u64,
+    ) -> Boxed<'_, Result<Self, OpenError>> {
+        Box::pin(async move {
+            let (file, _) = DataFile::open(dir, TELEMETRY_DB, TELEMETRY).await?;
+            let readers = file.readers().await?;
+            let writer = FramesWriter::open(file.clone(), site_id.clone(), clock, bytes_max).await?;
+            let (commands, queue) = FramesQueue::new();
+            let (ended_sender, ended) = oneshot::channel();
+            tokio::spawn(async move {
+                run(writer, queue).await;
+                drop(ended_sender);
+            });
+            tokio::spawn(file.checkpoint(ended));
+            Ok(Self { site_id, commands, readers })
+        })
     }
 
     /// Finishes what is queued and closes the file. Everything asked afterwards is refused.
-    pub async fn close(&self) {
-        // An error means that it is closed already.
-        let _ = self.commands.ask(|reply| Command::Close { reply }).await;
-        self.readers.close().await;
+    pub fn close(&self) -> Boxed<'_, ()> {
+        Box::pin(async move {
+            // An error means that it is closed already.
+            let _ = self.commands.ask(|reply| Command::Close { reply }).await;
+            self.readers.close().await;
+        })
     }
 }
 

@@ -25,6 +25,7 @@ use crate::{
 };
 use async_trait::async_trait;
 use file::DataFile;
+use midshift_core::Boxed;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Item, Key, Log, Naming, Part, Row, Seq, Writer as Author};
@@ -44,10 +45,12 @@ const TELEMETRY_DB: &str = "telemetry.db";
 ///
 /// # Errors
 /// If the directory is in use or a file is newer than this binary.
-pub async fn migrate(dir: &Path) -> Result<Vec<Migrated>, OpenError> {
-    let (_control, control) = DataFile::open(dir, CONTROL_DB, CONTROL).await?;
-    let (_telemetry, telemetry) = DataFile::open(dir, TELEMETRY_DB, TELEMETRY).await?;
-    Ok(vec![control, telemetry])
+pub fn migrate(dir: &Path) -> Boxed<'_, Result<Vec<Migrated>, OpenError>> {
+    Box::pin(async move {
+        let (_control, control) = DataFile::open(dir, CONTROL_DB, CONTROL).await?;
+        let (_telemetry, telemetry) = DataFile::open(dir, TELEMETRY_DB, TELEMETRY).await?;
+        Ok(vec![control, telemetry])
+    })
 }
 
 /// A [`Store`] in `control.db` of a data directory.
@@ -65,34 +68,38 @@ impl SqliteStore {
     ///
     /// # Errors
     /// If another server has the directory, it belongs to another site, is newer than this binary, or cannot be durable.
-    pub async fn open(dir: &Path, site_id: SiteId, clock: Arc<dyn Clock>) -> Result<Self, OpenError> {
-        let (file, migrated) = DataFile::open(dir, CONTROL_DB, CONTROL).await?;
-        if !migrated.applied.is_empty() {
-            tracing::info!(file = migrated.file, from = migrated.from, to = migrated.to, "schema migrated");
-        }
-        let mut connection = file.writer().await?;
-        let id = writer::identify(&mut connection, &site_id, clock.now().wall).await?;
-        let head = writer::head(&mut connection, &site_id)
-            .await
-            .map_err(|source| OpenError::Sql { doing: "reading the head", source })?;
-        let readers = file.readers().await?;
-        let tail = Arc::new(Tail::new(head));
-        let (wake_sender, wake) = watch::channel(head);
-        let (ended_sender, ended) = oneshot::channel();
-        let (commands, queue) = Queue::new();
-        let writer = Writer::new(file.clone(), connection, site_id.clone(), clock, tail.clone(), wake_sender, head);
-        tokio::spawn(async move {
-            run(writer, queue).await;
-            drop(ended_sender);
-        });
-        tokio::spawn(file.checkpoint(ended));
-        Ok(Self { id, site_id, commands, readers, tail, wake })
+    pub fn open(dir: &Path, site_id: SiteId, clock: Arc<dyn Clock>) -> Boxed<'_, Result<Self, OpenError>> {
+        Box::pin(async move {
+            let (file, migrated) = DataFile::open(dir, CONTROL_DB, CONTROL).await?;
+            if !migrated.applied.is_empty() {
+                tracing::info!(file = migrated.file, from = migrated.from, to = migrated.to, "schema migrated");
+            }
+            let mut connection = file.writer().await?;
+            let id = writer::identify(&mut connection, &site_id, clock.now().wall).await?;
+            let head = writer::head(&mut connection, &site_id)
+                .await
+                .map_err(|source| OpenError::Sql { doing: "reading the head", source })?;
+            let readers = file.readers().await?;
+            let tail = Arc::new(Tail::new(head));
+            let (wake_sender, wake) = watch::channel(head);
+            let (ended_sender, ended) = oneshot::channel();
+            let (commands, queue) = Queue::new();
+            let writer = Writer::new(file.clone(), connection, site_id.clone(), clock, tail.clone(), wake_sender, head);
+            tokio::spawn(async move {
+                run(writer, queue).await;
+                drop(ended_sender);
+            });
+            tokio::spawn(file.checkpoint(ended));
+            Ok(Self { id, site_id, commands, readers, tail, wake })
+        })
     }
 
     /// Finishes what is queued and closes the file. Everything asked afterwards is refused.
-    pub async fn close(&self) {
-        self.commands.close().await;
-        self.readers.close().await;
+    pub fn close(&self) -> Boxed<'_, ()> {
+        Box::pin(async move {
+            self.commands.close().await;
+            self.readers.close().await;
+        })
     }
 
     async fn page(

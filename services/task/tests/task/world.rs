@@ -15,13 +15,14 @@ use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskState};
 use midshift_core::time::{Clock, Now, SiteTime, Utc};
 use midshift_proto::access::local;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
-use midshift_proto::task::v1::task_service_server::{TaskService as _, TaskServiceServer};
+use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_request::Body, watch_tasks_response};
 use midshift_store::{MemoryStore, Store, StoreId, load};
 use midshift_task::{Parts, TaskService};
 use std::sync::Arc;
 use tokio_stream::{Stream, StreamExt};
 use tokio_util::sync::CancellationToken;
+use tonic::service::Routes;
 
 /// 2027-01-15, 08:00 UTC.
 pub const NOON: Utc = Utc(1_800_000_000_000);
@@ -77,8 +78,8 @@ impl World {
         TaskService::open(parts, self.shutdown.clone()).await.expect("a store opens")
     }
     /// A client that calls the service in this process, through its codec.
-    pub fn client(&self) -> TaskServiceClient<TaskServiceServer<TaskService>> {
-        TaskServiceClient::new(self.service.grpc())
+    pub fn client(&self) -> TaskServiceClient<Routes> {
+        TaskServiceClient::new(self.service.add_to(Routes::default()))
     }
     pub async fn get(&self, task_id: &str) -> v1::Task {
         let request = v1::GetTaskRequest { task_id: task_id.to_owned() };

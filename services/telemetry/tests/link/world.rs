@@ -17,7 +17,7 @@ use std::sync::{Arc, Mutex};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::sync::CancellationToken;
-use tonic::service::InterceptorLayer;
+use tonic::service::{InterceptorLayer, Routes};
 use tonic::transport::{Channel, Endpoint, Server};
 use tonic::{Request, Status, Streaming};
 
@@ -118,8 +118,7 @@ pub async fn serve_after(parts: Parts, read: impl Future<Output = ()> + Send + '
         request.extensions_mut().insert(told.lock().expect("not poisoned").clone());
         known(request)
     });
-    let mut port = Server::builder().layer(layer);
-    let server = port.add_service(service.link()).add_service(service.replay()).add_service(service.grpc());
+    let server = Server::builder().layer(layer).add_routes(service.add_to(Routes::default()));
     tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
     let channel = dial(pipes.clone()).await?;
     Ok(World { store, channel, service, board, end, leaving, pipes })

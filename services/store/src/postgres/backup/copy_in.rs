@@ -8,6 +8,7 @@ use crate::migrations::{Migration, pending};
 use crate::postgres::connect::{Database, PostgresConfig};
 use crate::postgres::{CONTROL_SCHEMA, migrate, write_sql};
 use crate::{OpenError, StoreId, sql};
+use midshift_core::Boxed;
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Item, Row as StoredRow, Table};
 use sqlx::{AssertSqlSafe, PgConnection, Row};
@@ -81,66 +82,78 @@ impl PostgresRestore {
     ///
     /// # Errors
     /// If the database has a row of midshift, the copy is of a newer release, or one of the two fails.
-    pub async fn begin(
-        config: &PostgresConfig,
-        folder: &Path,
-        copy: &PostgresCopy,
-        id: &StoreId,
-    ) -> Result<Self, RestoreError> {
-        let mut connection = Database::new(config, CONTROL_SCHEMA)?.copier().await?;
-        in_time(sqlx::raw_sql(migrate::BEGIN).execute(&mut connection)).await.map_err(failed)?;
-        // Telemetry first: what ends in the schema on the search path is the store's.
-        for (schema, migrations) in SCHEMAS.into_iter().rev() {
-            let version = copy.version(schema);
-            let later = pending(schema, migrations, version)?;
-            let made = migrations.get(..migrations.len() - later.len()).unwrap_or_default();
-            empty(&mut connection, (schema, migrations), made).await?;
-            for table in &tables(schema, made) {
-                let copied = copy.schemas.get(schema).and_then(|s| s.tables.get(table.name)).copied();
-                fill(&mut connection, folder, table, copied.unwrap_or(0)).await?;
+    pub fn begin<'a>(
+        config: &'a PostgresConfig,
+        folder: &'a Path,
+        copy: &'a PostgresCopy,
+        id: &'a StoreId,
+    ) -> Boxed<'a, Result<Self, RestoreError>> {
+        Box::pin(async move {
+            let mut connection = Database::new(config, CONTROL_SCHEMA)?.copier().await?;
+            in_time(sqlx::raw_sql(migrate::BEGIN).execute(&mut connection)).await.map_err(failed)?;
+            // Telemetry first: what ends in the schema on the search path is the store's.
+            for (schema, migrations) in SCHEMAS.into_iter().rev() {
+                let version = copy.version(schema);
+                let later = pending(schema, migrations, version)?;
+                let made = migrations.get(..migrations.len() - later.len()).unwrap_or_default();
+                empty(&mut connection, (schema, migrations), made).await?;
+                for table in &tables(schema, made) {
+                    let copied = copy.schemas.get(schema).and_then(|s| s.tables.get(table.name)).copied();
+                    fill(&mut connection, folder, table, copied.unwrap_or(0)).await?;
+                }
+                in_time(migrate::climb(&mut connection, version, later)).await.map_err(failed)?;
             }
-            in_time(migrate::climb(&mut connection, version, later)).await.map_err(failed)?;
-        }
-        in_time(sqlx::query(sql::RENEW).bind(&*id.0).execute(&mut connection)).await.map_err(failed)?;
-        Ok(Self { connection, config: config.clone(), id: id.clone() })
+            in_time(sqlx::query(sql::RENEW).bind(&*id.0).execute(&mut connection)).await.map_err(failed)?;
+            Ok(Self { connection, config: config.clone(), id: id.clone() })
+        })
     }
 
     /// All rows of these tables, as they are about to be.
     ///
     /// # Errors
     /// The database.
-    pub async fn rows(&mut self, site_id: &SiteId, tables: &[Table]) -> Result<Vec<StoredRow>, RestoreError> {
-        let mut rows = Vec::new();
-        for table in tables {
-            let select = sqlx::query(AssertSqlSafe(sql::whole(*table))).bind(site_id.as_str());
-            for row in &in_time(select.fetch_all(&mut self.connection)).await.map_err(failed)? {
-                rows.push(sql::row(*table, row).map_err(failed)?);
+    pub fn rows<'a>(
+        &'a mut self,
+        site_id: &'a SiteId,
+        tables: &'a [Table],
+    ) -> Boxed<'a, Result<Vec<StoredRow>, RestoreError>> {
+        Box::pin(async move {
+            let mut rows = Vec::new();
+            for table in tables {
+                let select = sqlx::query(AssertSqlSafe(sql::whole(*table))).bind(site_id.as_str());
+                for row in &in_time(select.fetch_all(&mut self.connection)).await.map_err(failed)? {
+                    rows.push(sql::row(*table, row).map_err(failed)?);
+                }
             }
-        }
-        Ok(rows)
+            Ok(rows)
+        })
     }
 
     /// Writes rows of an item with the others. No log has them: the restored store is another one, which everybody reads anew.
     ///
     /// # Errors
     /// The database.
-    pub async fn amend(&mut self, site_id: &SiteId, item: &Item) -> Result<(), RestoreError> {
-        in_time(write_sql::rows(&mut self.connection, site_id, &amended(item))).await.map_err(failed)
+    pub fn amend<'a>(&'a mut self, site_id: &'a SiteId, item: &'a Item) -> Boxed<'a, Result<(), RestoreError>> {
+        Box::pin(async move {
+            in_time(write_sql::rows(&mut self.connection, site_id, &amended(item))).await.map_err(failed)
+        })
     }
 
     /// Makes it what servers can open, durable.
     ///
     /// # Errors
     /// [`RestoreError::Unknown`] if nobody knows; after any other the database is as it was before.
-    pub async fn commit(mut self) -> Result<(), RestoreError> {
-        match in_time(sqlx::raw_sql("COMMIT").execute(&mut self.connection)).await {
-            Ok(_) => Ok(()),
-            Err(error) if is_undone(&error) => Err(failed(error)),
-            Err(error) => match self.is_there().await {
-                Ok(true) => Ok(()),
-                Ok(false) | Err(_) => Err(RestoreError::Unknown(error)),
-            },
-        }
+    pub fn commit(mut self) -> Boxed<'static, Result<(), RestoreError>> {
+        Box::pin(async move {
+            match in_time(sqlx::raw_sql("COMMIT").execute(&mut self.connection)).await {
+                Ok(_) => Ok(()),
+                Err(error) if is_undone(&error) => Err(failed(error)),
+                Err(error) => match self.is_there().await {
+                    Ok(true) => Ok(()),
+                    Ok(false) | Err(_) => Err(RestoreError::Unknown(error)),
+                },
+            }
+        })
     }
 
     /// Whether the database holds the restored store.

@@ -6,6 +6,7 @@ use crate::migrations::{VERSION, pending};
 use crate::postgres::connect::{Database, PostgresConfig};
 use crate::postgres::{CONTROL_SCHEMA, read};
 use crate::{OpenError, sql};
+use midshift_core::Boxed;
 use midshift_core::rows::Seq;
 use sqlx::{AssertSqlSafe, Connection, PgConnection, Row};
 use std::collections::BTreeMap;
@@ -44,42 +45,44 @@ impl PostgresCopy {
     /// # Errors
     /// If the database cannot be reached, was written by a newer release, has only one of the schemas or a table that this user may not read
     /// whole, or the files cannot be written. Some are there then.
-    pub async fn take(config: &PostgresConfig, folder: &Path) -> Result<Option<Self>, OpenError> {
-        let mut connection = Database::new(config, CONTROL_SCHEMA)?.copier().await?;
-        in_time(sqlx::raw_sql(read::BEGIN).execute(&mut connection)).await.map_err(failed)?;
-        let mut schemas = BTreeMap::new();
-        let mut shapes = Vec::new();
-        for (schema, migrations) in SCHEMAS {
-            let version = version(&mut connection, schema).await?;
-            let ahead = pending(schema, migrations, version)?.len();
-            let of_version = tables(schema, migrations.get(..migrations.len() - ahead).unwrap_or_default());
-            schemas.insert(schema.to_owned(), CopiedSchema { version, tables: BTreeMap::new() });
-            shapes.extend(of_version);
-        }
-        if !shapes.iter().any(|table| table.name == "store_head") {
-            return Ok(None);
-        }
-        let head = in_time(sqlx::query(sql::STORE).fetch_optional(&mut connection)).await.map_err(failed)?;
-        let Some(head) = head else { return Ok(None) };
-        if let Some((schema, _)) =
-            SCHEMAS.into_iter().find(|(schema, _)| schemas.get(*schema).is_none_or(CopiedSchema::is_unmade))
-        {
-            return Err(OpenError::NoSchema { schema });
-        }
-        let mut copy = Self {
-            site_id: head.try_get(0).map_err(failed)?,
-            store_id: head.try_get(1).map_err(failed)?,
-            head: Seq(head.try_get::<i64, _>(2).map_err(failed)?.cast_unsigned()),
-            schemas,
-        };
-        for table in &shapes {
-            let rows = write(&mut connection, folder, table).await?;
-            if let Some(schema) = copy.schemas.get_mut(table.schema) {
-                schema.tables.insert(table.name.to_owned(), rows);
+    pub fn take<'a>(config: &'a PostgresConfig, folder: &'a Path) -> Boxed<'a, Result<Option<Self>, OpenError>> {
+        Box::pin(async move {
+            let mut connection = Database::new(config, CONTROL_SCHEMA)?.copier().await?;
+            in_time(sqlx::raw_sql(read::BEGIN).execute(&mut connection)).await.map_err(failed)?;
+            let mut schemas = BTreeMap::new();
+            let mut shapes = Vec::new();
+            for (schema, migrations) in SCHEMAS {
+                let version = version(&mut connection, schema).await?;
+                let ahead = pending(schema, migrations, version)?.len();
+                let of_version = tables(schema, migrations.get(..migrations.len() - ahead).unwrap_or_default());
+                schemas.insert(schema.to_owned(), CopiedSchema { version, tables: BTreeMap::new() });
+                shapes.extend(of_version);
             }
-        }
-        connection.close().await.map_err(failed)?;
-        Ok(Some(copy))
+            if !shapes.iter().any(|table| table.name == "store_head") {
+                return Ok(None);
+            }
+            let head = in_time(sqlx::query(sql::STORE).fetch_optional(&mut connection)).await.map_err(failed)?;
+            let Some(head) = head else { return Ok(None) };
+            if let Some((schema, _)) =
+                SCHEMAS.into_iter().find(|(schema, _)| schemas.get(*schema).is_none_or(CopiedSchema::is_unmade))
+            {
+                return Err(OpenError::NoSchema { schema });
+            }
+            let mut copy = Self {
+                site_id: head.try_get(0).map_err(failed)?,
+                store_id: head.try_get(1).map_err(failed)?,
+                head: Seq(head.try_get::<i64, _>(2).map_err(failed)?.cast_unsigned()),
+                schemas,
+            };
+            for table in &shapes {
+                let rows = write(&mut connection, folder, table).await?;
+                if let Some(schema) = copy.schemas.get_mut(table.schema) {
+                    schema.tables.insert(table.name.to_owned(), rows);
+                }
+            }
+            connection.close().await.map_err(failed)?;
+            Ok(Some(copy))
+        })
     }
 }
 
