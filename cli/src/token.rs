@@ -2,9 +2,9 @@
 
 use super::client::{Call, Exit, unary};
 use super::out::Out;
-use midshift_agent::clock;
 use crate::duration;
 use clap::Subcommand;
+use midshift_agent::clock;
 use midshift_core::identity::Grant;
 use midshift_core::time::Utc;
 use midshift_proto::convert::time_of;

@@ -2,9 +2,9 @@
 
 use super::{handed, public_key, read_keys, told};
 use crate::client::Exit;
-use midshift_agent::clock;
 use crate::out::{Format, Out, columns};
 use clap::{Subcommand, ValueEnum};
+use midshift_agent::clock;
 use midshift_agent::trust::Trust;
 use midshift_bundle::folder::{Error, Folder, Signed, WaitingRoot};
 use midshift_bundle::keys::{KeyId, PublicKey, SecretKey};
