@@ -757,3 +757,22 @@ fn every_enum_that_is_read_from_rows_has_a_decision_for_words_of_a_newer_version
     let decided = WORDS.iter().flat_map(|(_, names)| names.iter().map(|name| (*name).to_owned())).collect();
     assert_eq!(found, decided, "an enum of core that is read has no decision, or is gone");
 }
+
+#[test]
+fn a_target_that_is_not_compiled_for_tests_has_none() {
+    let manifests = files("", "toml").into_iter().filter(|path| path.ends_with("/Cargo.toml"));
+    let mut targets = 0;
+    for manifest in manifests {
+        let room = manifest.trim_end_matches("/Cargo.toml");
+        let described: toml::Table = read(&manifest).parse().expect("a manifest");
+        let untested = |target: &toml::Value| target.get("test").and_then(toml::Value::as_bool) == Some(false);
+        let lib = described.get("lib").filter(|target| untested(target)).map(|_| files(&format!("{room}/src"), "rs"));
+        let bins = described.get("bin").and_then(toml::Value::as_array).into_iter().flatten();
+        let bins = bins.filter(|target| untested(target)).filter_map(|target| target.get("path")?.as_str());
+        for path in lib.into_iter().flatten().chain(bins.map(|path| format!("{room}/{path}"))) {
+            targets += 1;
+            assert!(!read(&path).contains("#[cfg(test)]") && !read(&path).contains("#[test]"), "{path}");
+        }
+    }
+    assert!(targets > 0, "no manifest was read");
+}
