@@ -15,7 +15,7 @@ use std::process::Command;
 /// Programs of an archive.
 const PROGRAMS: [&str; 2] = ["midshift", "midshift-launcher"];
 /// What goes with them, files and folders of the repository.
-const BESIDE: [&str; 13] = [
+const BESIDE: [&str; 15] = [
     "ARCHITECTURE.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
@@ -28,6 +28,8 @@ const BESIDE: [&str; 13] = [
     "docs",
     "ota_bundles/README.md",
     "proto",
+    "robot_agent/examples/own_robot.rs",
+    "robot_agent/src/body.rs",
     "sites",
 ];
 

@@ -124,18 +124,30 @@ fn on_trial() -> v1::RolloutRobot {
 fn the_tree_shows_each_wave_and_the_robots_that_are_on_their_way() {
     let robots =
         [draining(), on_trial(), robot("rbt-09", 1, RolloutStep::Staged), robot("rbt-01", 0, RolloutStep::Committed)];
-    let mut lines = text::header(&rollout());
-    lines.extend(text::tree(&rollout(), robots.iter()));
+    let mut waves = rollout().waves;
+    waves[2].counts = Some(v1::RolloutCounts { staged: 8, ..Default::default() });
+    let phase = RolloutPhase::Applying as i32;
+    let rollout = v1::Rollout { phase, soak_left: None, skipped_by_reason: Default::default(), waves, ..rollout() };
+    let mut lines = text::header(&rollout);
+    lines.extend(text::tree(&rollout, robots.iter()));
     let expected = "\
-walk-1.5.0  SOAKING  wave 2/3  bundle walk-1.5.0
-  since 1970-01-01T00:01:40.000Z, 1 robot out of work, soak 8.0 s left
-  skipped: 1 SKIPPED_OFFLINE
+walk-1.5.0  APPLYING  wave 2/3  bundle walk-1.5.0
+  since 1970-01-01T00:01:40.000Z, 1 robot out of work
 ├─ wave 1/3: 1 robot, kept  1 committed
 ├─ wave 2/3: 3 robots  1 staged, 1 draining, 1 on trial
 │    rbt-04  DRAINING  waits: WAITING_FOR_DRAIN
 │    rbt-02  TRIAL, 1 tasks done, 0 failed
-└─ wave 3/3: 9 robots  8 waiting, 1 skipped";
+└─ wave 3/3: 8 robots  8 staged";
     assert_eq!(lines.join("\n"), expected);
+}
+
+#[test]
+fn the_head_says_how_long_a_wave_is_watched_and_who_was_passed_over() {
+    let expected = "\
+walk-1.5.0  SOAKING  wave 2/3  bundle walk-1.5.0
+  since 1970-01-01T00:01:40.000Z, 1 robot out of work, soak 8.0 s left
+  skipped: 1 SKIPPED_OFFLINE";
+    assert_eq!(text::header(&rollout()).join("\n"), expected);
 }
 
 #[test]

@@ -361,6 +361,7 @@ mod tests {
         let example = page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("an example");
         let site = parse(example).expect("reads");
         assert_eq!((site.site_id().as_str(), site.stations().count()), ("shop", 1));
+        assert_eq!(super::super::lint::lint(&site, None), []);
     }
 
     #[test]
