@@ -152,6 +152,12 @@ pub enum Effect {
     AtMostOnce,
 }
 
+/// The step an attempt begins with, so that the robot stands where `next_step` is done.
+pub fn from_step(steps: &[WorkStep], next_step: u32) -> u32 {
+    let mut done = steps.iter().enumerate().take(next_step as usize + 1);
+    done.rfind(|(_, s)| matches!(s.kind, StepKind::Goto { .. })).map_or(next_step, |(i, _)| i as u32)
+}
+
 /// One waypoint of a route.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RoutePoint {

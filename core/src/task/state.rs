@@ -258,6 +258,9 @@ pub struct Been {
     pub ring: String,
     /// Standing places at which a step is done and that it entered, or stood in already: at most one a step.
     pub places: BTreeSet<PlaceId>,
+    /// The step with which the attempt goes on: those before it were done by attempts before.
+    #[serde(default)]
+    pub resume_step: u32,
     /// A part of what the robot said meanwhile is lost.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub is_broken: bool,

@@ -96,7 +96,7 @@ pub fn pair(
     if routing::is_too_long(view, here, &goals, legs_mm.iter().sum()) {
         return Err(Reason::from(Code::RouteTooLong).with("points_max", limits::ROUTE_POINTS_MAX));
     }
-    let from = routing::from_step(&intake.spec.steps, task.next_step) as usize;
+    let from = crate::work::from_step(&intake.spec.steps, task.next_step) as usize;
     let mut trip = Trip::new(load.is_some(), intake.spec.speed_limit_mm_s);
     let mut legs_mm = legs_mm.into_iter();
     for step in intake.spec.steps.iter().skip(from) {
@@ -150,7 +150,7 @@ fn journey(
     intake: &TaskIntake,
 ) -> Result<(WaypointIx, Vec<WaypointIx>), Reason> {
     let here = routing::find(view, live.report.vitals.waypoint.as_ref()).ok_or(Code::RobotUnlocated)?;
-    let from = routing::from_step(&intake.spec.steps, task.next_step);
+    let from = crate::work::from_step(&intake.spec.steps, task.next_step);
     let goals: Option<Vec<WaypointIx>> = intake.spec.goals(from as usize).map(|g| view.site.find(g)).collect();
     Ok((here, goals.ok_or(Code::NoRoute)?))
 }

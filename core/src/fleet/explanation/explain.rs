@@ -53,7 +53,7 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
     let position = view.queue.position(task_id);
     let goal = intake
         .spec
-        .next_goal(routing::from_step(&intake.spec.steps, task.next_step) as usize)
+        .next_goal(crate::work::from_step(&intake.spec.steps, task.next_step) as usize)
         .and_then(|g| view.site.find(g));
     let mut candidates = Vec::new();
     let mut filtered = BTreeMap::new();
@@ -183,7 +183,7 @@ pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Optio
             .map(|why| closures::name_closed(view, why));
         let goal = intake
             .spec
-            .next_goal(routing::from_step(&intake.spec.steps, task.next_step) as usize)
+            .next_goal(crate::work::from_step(&intake.spec.steps, task.next_step) as usize)
             .and_then(|g| view.site.find(g));
         let distance_mm = at.zip(goal).and_then(|(at, goal)| view.router.distance_mm(at, goal));
         Some(TaskCandidate { task_id: task_id.clone(), reason, distance_mm })

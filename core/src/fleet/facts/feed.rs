@@ -126,7 +126,7 @@ pub fn reread(view: &mut View, keys: &[Key], rows: &[Row]) -> Result<(), BadRow>
     Ok(())
 }
 
-/// Puts rows as they were just read over what was to become of `keys`; other rows are those that [`view::named`] names, which this picture
+/// Puts rows as they were just read over what was to become of `keys`; other rows are those that [`named`](crate::fleet::projection::named) names, which this picture
 /// may have let go.
 ///
 /// # Errors

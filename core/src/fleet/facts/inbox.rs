@@ -124,8 +124,10 @@ pub fn place(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64,
     let holder = known.as_ref().map(|place| place.holder(robot_id));
     // Of a place whose row cannot be read nobody knows whether it stood there.
     let was_inside = holder.is_none_or(|holder| holder.is_some_and(|holder| holder.state == HolderState::Inside));
-    if was_inside || news == PlaceNews::Entered {
+    if news == PlaceNews::Entered {
         arrivals::note(tx, robot_id, place_id);
+    } else if was_inside {
+        arrivals::note_left(tx, robot_id, place_id);
     }
     let Some(mut place) = known else { return };
     let Some(at) = place.holders.iter().position(|h| h.robot_id == *robot_id && h.grant_id == grant_id) else {

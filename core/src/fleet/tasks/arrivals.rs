@@ -1,7 +1,8 @@
 //! Whether a robot that says that its task, or a part of it, is done was where that is done.
 //!
 //! 1. Every standing place of a goto that the attempt had to do must have been entered by its robot since it has the attempt, by its own
-//!    word: in order, since what it says of places and of attempts comes in one lane. Where it stood already counts.
+//!    word: in order, since what it says of places and of attempts comes in one lane. Where it stands or stood already counts for the steps
+//!    that it has come to, not for later ones.
 //! 2. An event that says that the work is over without that waits for the next heartbeat that counts. If that says the same, the task asks a
 //!    person, and the robot gets no work until a person has closed its incident. A failure owes the steps that it claims, a success all.
 //! 3. While the work goes on, a step that was claimed and not seen is not done for the task, unless a later one must not be done twice.
@@ -9,8 +10,8 @@
 //! 5. What cannot be decided is believed: the map has changed, the store turned out to be older than the robot, a person cleared the place,
 //!    its row cannot be read, or an older version began the attempt.
 //!
-//! Called by `facts::inbox` for events, by `facts::repair` for heartbeats, and by `transitions` for steps. `facts::disbelief` acts on it. Invariant: nothing here frees a place or
-//! moves a task forward.
+//! Called by `facts::inbox` for events, by `facts::repair` for heartbeats, and by `transitions` for steps. `facts::disbelief` acts on it.
+//! Invariant: nothing here frees a place or moves a task forward.
 
 use super::{claims, plausible};
 use crate::fleet::decision::plan::{Plan, Tx};
@@ -20,7 +21,7 @@ use crate::ids::{AttemptId, PlaceId, RobotId};
 use crate::site::Site;
 use crate::task::{Attempt, AttemptPhase};
 use crate::time::Now;
-use crate::work::{AttemptReport, Effect, Live, StepKind, WorkState, WorkStep};
+use crate::work::{AttemptReport, Effect, Live, StepKind, WorkState, WorkStep, from_step};
 
 /// The standing place where the step ends; none: it is no goto, or nothing is reserved there.
 fn goal<'s>(site: &'s Site, step: &WorkStep) -> Option<&'s PlaceId> {
@@ -29,14 +30,37 @@ fn goal<'s>(site: &'s Site, step: &WorkStep) -> Option<&'s PlaceId> {
     Some(&site.place(at).place_id)
 }
 
-/// The robot is or was inside of the place, or a person cleared it of the robot: that is noted if its attempt has a step there.
+/// The robot entered the place, or a person cleared it of the robot: that is noted if its attempt has a step there.
 pub fn note(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId) {
+    note_until(tx, robot_id, place_id, u32::MAX);
+}
+
+/// The robot left the place, in which it stood.
+pub fn note_left(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId) {
+    let step = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).map(|a| a.step_index);
+    note_until(tx, robot_id, place_id, step.unwrap_or_default());
+}
+
+/// Takes from a heartbeat at which waypoint the robot is.
+pub fn note_standing(tx: &mut Tx, live: &Live) {
+    let site = tx.view.site.clone();
+    let at = live.report.vitals.waypoint.as_ref().and_then(|waypoint| site.find(waypoint));
+    let Some(place) = at.and_then(|at| site.standing_at(at)) else { return };
+    let Some(a) = tx.view.held_by(&live.robot_id).and_then(|id| tx.view.attempt(id)) else { return };
+    let listed = live.report.attempts.iter().find(|listed| listed.attempt == a.attempt);
+    let step = listed.map_or(0, |listed| listed.step_index).max(a.step_index);
+    note_until(tx, &live.robot_id, &site.place(place).place_id, step);
+}
+
+/// Notes the place if one of the steps of the robot's attempt up to `last` ends there.
+fn note_until(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, last: u32) {
     let Some(a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)) else { return };
     let is_known = a.been.as_ref().is_none_or(|been| been.places.contains(place_id));
     let Some(intake) = a.attempt.subject.task_id().filter(|_| !is_known).and_then(|id| tx.view.intake(id)) else {
         return;
     };
-    if !intake.spec.steps.iter().any(|step| goal(&tx.view.site, step) == Some(place_id)) {
+    let mut steps = (0..=last).zip(&intake.spec.steps);
+    if !steps.any(|(_, step)| goal(&tx.view.site, step) == Some(place_id)) {
         return;
     }
     let mut a = a.clone();
@@ -44,15 +68,6 @@ pub fn note(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId) {
         been.places.insert(place_id.clone());
     }
     tx.put(a, "attempt.changed");
-}
-
-/// Takes from a heartbeat at which waypoint the robot is.
-pub fn note_standing(tx: &mut Tx, live: &Live) {
-    let site = tx.view.site.clone();
-    let at = live.report.vitals.waypoint.as_ref().and_then(|waypoint| site.find(waypoint));
-    if let Some(place) = at.and_then(|at| site.standing_at(at)) {
-        note(tx, &live.robot_id, &site.place(place).place_id);
-    }
 }
 
 /// Something that the robot said is lost: of its attempt nobody can tell any more where it was until now.
@@ -89,8 +104,11 @@ fn may_end(a: &Attempt) -> bool {
 /// that cannot be told.
 pub fn unseen(view: &View, now: &Now, robot_id: &RobotId, report: &AttemptReport) -> Option<PlaceId> {
     let id = &report.attempt;
-    let task_id = id.subject.task_id().filter(|_| report.state.is_over() && report.state != WorkState::Refused)?;
+    let task_id = id.subject.task_id().filter(|_| report.state.is_over())?;
     let a = view.attempt(id).filter(|a| a.robot_id == *robot_id && may_end(a))?;
+    if report.state == WorkState::Refused && a.accepted.is_none() {
+        return None; // It never began.
+    }
     let is_newest = view.task(task_id)?.attempt_id().as_ref() == Some(id);
     if !is_newest || plausible::judge(view, id, robot_id, report.state, report.step_index).is_some() {
         return None;
@@ -110,34 +128,28 @@ pub(in crate::fleet) fn proven(view: &View, now: &Now, a: &Attempt, steps: &[Wor
 /// The first drive of the attempt among the first `claimed` steps that ends where its robot was not seen.
 fn unproven(view: &View, now: &Now, a: &Attempt, claimed: u32, is_success: bool) -> Option<(u32, PlaceId)> {
     let been = a.been.as_ref().filter(|_| !view.bugs.success_is_believed())?;
-    let mut goals = goals(view, a, claimed)?;
+    let steps = &view.intake(a.attempt.subject.task_id()?)?.spec.steps;
+    let begun = (is_success || claimed > been.resume_step).then(|| from_step(steps, been.resume_step));
+    let is_due = |step: u32| (been.resume_step..claimed).contains(&step) || begun == Some(step);
+    let drives = (0..).zip(steps).filter(|(step, what)| is_due(*step) && matches!(what.kind, StepKind::Goto { .. }));
+    let mut drives: Vec<(u32, &WorkStep)> = drives.collect();
+    let first = drives.first().map(|(step, _)| *step);
     let ring = &view.sessions.get(a.robot_id.as_str())?.row.ring;
     if been.is_broken || *ring != been.ring {
-        let kept = goals.len().saturating_sub(usize::from(is_success));
-        goals.drain(..kept);
+        let kept = if is_success { 1 } else { 0 };
+        drives.drain(..drives.len().saturating_sub(kept));
     }
-    let is_unseen = |place: &PlaceId| !been.places.contains(place) && is_elsewhere(view, &a.robot_id, place);
-    let unseen = goals.into_iter().find(|(_, place)| is_unseen(place));
-    unseen.filter(|_| !claims::is_ahead(view, &a.robot_id, now)).map(|(step, place)| (step, place.clone()))
-}
-
-/// Standing places that the attempt had to reach for the first `claimed` steps, each with its step. Once it is taken back nobody knows where
-/// it began: then those that its task is not past.
-fn goals<'v>(view: &'v View, a: &Attempt, claimed: u32) -> Option<Vec<(u32, &'v PlaceId)>> {
     let given = view.desired_work.get(a.robot_id.as_str()).and_then(|d| d.row.assignment.as_ref());
     let given = given.filter(|given| given.attempt == a.attempt);
-    let task_id = a.attempt.subject.task_id()?;
-    let (resume_step, steps) = match given {
-        Some(given) => (given.resume_step, &given.steps),
-        None => (view.task(task_id)?.next_step, &view.intake(task_id)?.spec.steps),
-    };
-    let begun = given.filter(|_| claimed > resume_step);
-    let is_due =
-        |step: u32| (resume_step..claimed).contains(&step) || begun.is_some_and(|given| given.from_step == step);
     let began_at = given.and_then(|given| given.route.first()?.standing.as_ref());
-    let due = (0..).zip(steps).filter(|(step, what)| is_due(*step) && !what.continue_on_fail);
-    let goals = due.filter_map(|(step, what)| Some((step, goal(&view.site, what)?)));
-    Some(goals.filter(|(_, place)| began_at != Some(*place)).collect())
+    let is_unseen = |step: u32, place: &PlaceId| {
+        let stood_there = Some(step) == first && began_at == Some(place);
+        !stood_there && !been.places.contains(place) && is_elsewhere(view, &a.robot_id, place)
+    };
+    let owed = drives.into_iter().filter(|(_, what)| !what.continue_on_fail);
+    let mut goals = owed.filter_map(|(step, what)| Some((step, goal(&view.site, what)?)));
+    let unseen = goals.find(|(step, place)| is_unseen(*step, place));
+    unseen.filter(|_| !claims::is_ahead(view, &a.robot_id, now)).map(|(step, place)| (step, place.clone()))
 }
 
 /// The row of the place says that the robot is not inside of it now. One that this build cannot read says nothing.

@@ -199,6 +199,9 @@ fn a_drive_that_may_fail_or_that_ends_where_nothing_is_reserved_asks_for_nothing
     }
 }
 
+/// What is asked otherwise than a transport asks it.
+type Change<'a> = &'a dyn Fn(&mut RawTask);
+
 /// What makes it impossible to tell.
 type Excuse<'a> = &'a dyn Fn(&mut Rig);
 
@@ -253,14 +256,81 @@ fn a_robot_of_which_a_part_is_lost_is_asked_for_its_last_goal_alone() {
         let mut rig = given();
         lose(&mut rig);
         assert_eq!(said_done(&mut rig), Phase::Running, "{what}");
-        lists(&mut rig, "B", WorkState::Succeeded, STEPS);
-        assert_eq!((rig.task("T1").phase, told(&rig)), (Phase::Succeeded, vec![]), "{what}");
+        let became = lists(&mut rig, "B", WorkState::Succeeded, STEPS);
+        assert!(became.contains(&"task.succeeded") && told(&rig).is_empty(), "{what}: {became:?}");
 
         let mut rig = given();
         is_in(&mut rig, &["B", "park-a"]);
         lose(&mut rig);
         assert_eq!((said_done(&mut rig), told(&rig)), (Phase::Succeeded, vec![]), "{what}: it was there before");
     }
+}
+
+#[test]
+fn a_robot_of_which_a_part_is_lost_owes_no_goal_before_its_last_one() {
+    let may_fail = |raw: &mut RawTask| raw.steps[2].continue_on_fail = Some(Some(true));
+    let not_reserved = |raw: &mut RawTask| raw.steps[2].kind = Some(RawStepKind::Goto("b-in".to_owned()));
+    let starts: [(&str, Change); 3] = [("B", &|_| {}), ("park-a", &may_fail), ("park-a", &not_reserved)];
+    for (start, change) in starts {
+        for (what, lose) in BREAKS {
+            let mut rig = given_at(start, change);
+            lose(&mut rig);
+            is_in(&mut rig, &["B"]);
+            assert_eq!((said_done(&mut rig), told(&rig)), (Phase::Succeeded, vec![]), "{what}, from {start}");
+        }
+    }
+}
+
+#[test]
+fn a_robot_that_began_where_its_task_ends_has_to_come_back_there() {
+    let mut rig = given_at("B", |_| {});
+    lists(&mut rig, "B", WorkState::Navigating, 0);
+    let left = RobotEvent::Place { place_id: PlaceId::parse("B").expect("an id"), grant_id: 0, news: PlaceNews::Left };
+    says(&mut rig, left);
+    is_in(&mut rig, &["A"]);
+    assert_eq!(said_done(&mut rig), Phase::Running);
+    lists(&mut rig, "A", WorkState::Succeeded, STEPS);
+    assert_eq!((rig.task("T1").phase, told(&rig).len()), (Phase::NeedsOperator, 1));
+    assert_eq!(told(&rig)[0].metadata["place_id"], "B");
+}
+
+#[test]
+fn an_attempt_that_was_taken_is_not_refused_behind_steps_that_were_never_done() {
+    let mut rig = given();
+    reports(&mut rig, WorkState::Refused, STEPS);
+    assert_eq!(rig.task("T1").phase, Phase::Running, "its heartbeat is waited for");
+    lists(&mut rig, "park-a", WorkState::Refused, STEPS);
+    assert_eq!((rig.task("T1").phase, told(&rig).len()), (Phase::NeedsOperator, 1));
+}
+
+#[test]
+fn an_attempt_owes_nothing_of_the_steps_that_one_before_it_did() {
+    let mut rig = given();
+    let id = attempt(&rig).to_string();
+    let row = &mut rig.view.attempts.get_mut(&id).expect("an attempt").row;
+    row.been.as_mut().expect("its notes").resume_step = 2;
+    row.phase = AttemptPhase::Lost;
+    rig.view.desired_work.get_mut("r1").expect("its work").row.assignment = None;
+    // A person put the item back meanwhile.
+    let mut task = rig.task("T1").clone();
+    (task.phase, task.next_step) = (Phase::Queued, 0);
+    rig.change(&task);
+    reports(&mut rig, WorkState::Aborted, 2);
+    assert_eq!((told(&rig), rig.view.held_by(&robot_id())), (vec![], None));
+}
+
+#[test]
+fn an_attempt_that_is_over_is_not_forgotten_before_it_is_judged() {
+    let mut rig = given();
+    let id = attempt(&rig);
+    rig.view.attempts.get_mut(&id.to_string()).expect("an attempt").row.phase = AttemptPhase::Lost;
+    let mut task = rig.task("T1").clone();
+    task.phase = Phase::NeedsOperator;
+    rig.change(&task);
+    rig.says(&robot_id(), &id, WorkState::Succeeded, STEPS, 0);
+    said_done(&mut rig);
+    rig.cycle(Pace::Wake);
+    assert_eq!(rig.view.desired_work["r1"].row.closed, [], "the heartbeat that is to judge it does not count yet");
 }
 
 #[test]
@@ -292,9 +362,12 @@ fn a_robot_that_lists_an_attempt_no_more_whose_steps_it_claimed_from_afar_is_loo
     let mut rig = given();
     reports(&mut rig, WorkState::Navigating, 2);
     lists(&mut rig, "park-a", WorkState::Navigating, 2);
+    let applied = rig.view.desired_work["r1"].row.generation;
     let live = Arc::make_mut(rig.board.get_mut(&robot_id()).expect("a robot"));
     live.report.attempts.clear();
+    live.report.applied_work = applied;
     live.report.hb += 1;
+    rig.pass(1_000);
     rig.cycle(Pace::Sweep);
     assert_eq!((rig.task("T1").phase, told(&rig).len()), (Phase::NeedsOperator, 1));
 }

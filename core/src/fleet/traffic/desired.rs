@@ -15,6 +15,7 @@ use crate::fleet::tasks::{attempts, claims, load};
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
 use crate::policy::AreaPolicy;
+use crate::robot::ReportedAttempt;
 use crate::task::{Attempt, AttemptPhase, Then};
 use crate::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, Live, RoutePoint, WorkState};
 use std::collections::BTreeMap;
@@ -52,7 +53,7 @@ pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releas
         grants: grants(tx.view, robot_id, &old, board),
         held: is_held || (old.held && resume.is_none()),
         resume,
-        closed: closed(&old, live, live_attempt.as_ref().map(|a| &a.attempt)),
+        closed: closed(&old, live, live_attempt.as_ref().map(|a| &a.attempt), tx.view.held_by(robot_id)),
         maintenance: match tx.view.authority.get(robot_id.as_str()).map(|a| &a.row.holder) {
             Some(RobotHolder::Maintenance(drain_id)) => Some(drain_id.clone()),
             _ => None,
@@ -134,7 +135,7 @@ fn begin(view: &View, a: &Attempt, live: Option<&Live>) -> Option<Assignment> {
         }
         None => (attempts::steps(view, a), attempts::ERRAND_TIMEOUT.as_ms(), 0, None),
     };
-    let from_step = routing::from_step(&steps, resume_step);
+    let from_step = crate::work::from_step(&steps, resume_step);
     let goals = routing::goals(&view.site, &steps, from_step)?;
     let route = match here {
         Some(here) => routing::route(view, here, None, &goals)?,
@@ -194,10 +195,19 @@ fn resume(view: &View, robot_id: &RobotId, old: &DesiredWork, is_held: bool, boa
     }
 }
 
-fn closed(old: &DesiredWork, live: Option<&Live>, current: Option<&AttemptId>) -> Vec<AttemptId> {
+/// Attempts that the robot may forget. One that is over stays until it holds the robot no more: its end is yet to be judged.
+fn closed(
+    old: &DesiredWork,
+    live: Option<&Live>,
+    current: Option<&AttemptId>,
+    holder: Option<&AttemptId>,
+) -> Vec<AttemptId> {
     let Some(live) = live else { return old.closed.clone() };
-    let over = live.report.attempts.iter().filter(|r| r.state.is_over() || r.state == WorkState::StepUnknown);
-    let mut closed: Vec<AttemptId> = over.map(|r| r.attempt.clone()).filter(|id| Some(id) != current).collect();
+    let may_go = |r: &&ReportedAttempt| match r.state {
+        WorkState::StepUnknown => Some(&r.attempt) != current,
+        state => state.is_over() && Some(&r.attempt) != holder,
+    };
+    let mut closed: Vec<AttemptId> = live.report.attempts.iter().filter(may_go).map(|r| r.attempt.clone()).collect();
     closed.sort();
     closed
 }

@@ -27,12 +27,6 @@ pub fn goals(site: &Site, steps: &[WorkStep], from_step: u32) -> Option<Vec<(u32
     .collect()
 }
 
-/// The step an attempt begins with, so that the robot stands where `next_step` is done.
-pub fn from_step(steps: &[WorkStep], next_step: u32) -> u32 {
-    let mut done = steps.iter().enumerate().take(next_step as usize + 1);
-    done.rfind(|(_, s)| matches!(s.kind, StepKind::Goto { .. })).map_or(next_step, |(i, _)| i as u32)
-}
-
 /// The route from `start` through `goals`, with the ways between them; none if no lanes lead there.
 pub fn route(
     view: &View,
