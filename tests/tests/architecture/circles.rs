@@ -10,8 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Rooms, from the lowest to the highest: each uses only those before it.
 const FLEET: [&str; 8] =
     ["projection", "decision", "tasks", "traffic", "facts", "assignment", "maintenance", "explanation"];
-const ROLLOUT: [&str; 8] =
-    ["projection", "decision", "members", "judgement", "robots", "phases", "facts", "commands"];
+const ROLLOUT: [&str; 8] = ["projection", "decision", "members", "judgement", "robots", "phases", "facts", "commands"];
 
 /// Names from the root of the crate on.
 type Name = Vec<String>;
