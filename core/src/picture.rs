@@ -1,7 +1,8 @@
 //! Rows as a service's picture of them, and one decision being written into both the picture and an item of a commit.
 //!
-//! Called by `fleet` and `rollout`. Invariants: a row in a picture is at the revision it has in the store, or one that an item of the
-//! running cycle will write; a row written twice in one decision stands in its item once, with the first expectation and the last body.
+//! Called by `fleet` and `rollout`. Invariants: a row in a picture is at the revision it has in the store, or one that
+//! an item of the running cycle will write; a row written twice in one decision stands in its item once, with the first
+//! expectation and the last body.
 
 use crate::audit::Note;
 use crate::identity::Actor;
@@ -42,8 +43,8 @@ pub trait Viewed<P: Picture>: Record {
     fn changed(_picture: &mut P, _id: &str, _old: Option<&Self>) {}
 }
 
-/// Takes one row as the store has it; none: deleted. What the picture already has is passed over. A row with a value that this build does
-/// not know is kept aside.
+/// Takes one row as the store has it; none: deleted. What the picture already has is passed over. A row with a value
+/// that this build does not know is kept aside.
 ///
 /// # Errors
 /// A body that is damaged.
@@ -96,7 +97,8 @@ pub fn kind_of(item: &Item) -> &'static str {
     item.rows.first().map_or("", |row| row.kind)
 }
 
-/// What a decision was to change: its kind, and its rows but for marks, clocks and incidents, which are others each time.
+/// What a decision was to change: its kind, and its rows but for marks, clocks and incidents, which are others each
+/// time.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Outline {
     /// What happens to its first row.
@@ -237,13 +239,122 @@ impl<'a, P: Picture> Tx<'a, P> {
         }
         self.view
     }
-    /// The item, if the decision changed anything. Attempts stand before all else in it: whoever follows the feed knows the attempt
-    /// when the change of its task comes.
+    /// The item, if the decision changed anything. Attempts stand before all else in it: whoever follows the feed knows
+    /// the attempt when the change of its task comes.
     pub fn finish(mut self) -> Option<Item> {
         self.item.rows.sort_by_key(|row| row.key.table != Table::Attempt);
         (!self.item.is_empty()).then_some(self.item)
     }
 }
+
+/// What a picture derives from the rows of one table.
+pub trait Indexed<R>: Sized {
+    /// A row of it changed: brings what is derived from it up to date. Called after the change.
+    fn changed(picture: &mut Self, id: &str, old: Option<&R>);
+}
+
+/// The picture of a service, with one line for each table: the field, its record, its table, and `Indexed` where
+/// something is derived from it. It makes the struct, `new`, `WHOLE`, `carry_over`, and the ways of rows into it.
+///
+/// 1. `whole`: tables that hold only what is there now, or that are bounded by count. They are read whole, in this
+///    order.
+/// 2. `part`: tables of which it holds what something names.
+/// 3. `kept`: what only this process knows, and what a rebuild leaves alone.
+/// 4. `anew`: what begins anew with each reading of the rows.
+macro_rules! picture {
+    (
+        $(#[$about:meta])*
+        pub struct $name:ident of $writer:ident;
+        new($($arg:ident: $arg_type:ty),*);
+        whole {
+            $($(#[$whole_doc:meta])* $whole:ident: $whole_record:ident = $whole_table:ident $($whole_index:ident)?;)*
+        }
+        part { $($(#[$part_doc:meta])* $part:ident: $part_record:ident = $part_table:ident $($part_index:ident)?;)* }
+        kept { $($(#[$kept_doc:meta])* $kept:ident: $kept_type:ty = $kept_begin:expr;)* }
+        anew { $($(#[$anew_doc:meta])* $anew:ident: $anew_type:ty = $anew_begin:expr;)* }
+    ) => {
+        $(#[$about])*
+        pub struct $name {
+            $($(#[$whole_doc])* pub $whole: $crate::picture::Slot<$whole_record>,)*
+            $($(#[$part_doc])* pub $part: $crate::picture::Slot<$part_record>,)*
+            $($(#[$kept_doc])* pub $kept: $kept_type,)*
+            $($(#[$anew_doc])* pub $anew: $anew_type,)*
+        }
+
+        impl $name {
+            /// Tables that are read whole.
+            pub const WHOLE: &'static [$crate::rows::Table] = &[$($crate::rows::Table::$whole_table),*];
+
+            /// An empty picture of the site. `started`: when the service began; `read`: when its rows are read.
+            pub fn new($($arg: $arg_type),*) -> Self {
+                Self {
+                    $($whole: $crate::picture::Slot::new(),)*
+                    $($part: $crate::picture::Slot::new(),)*
+                    $($kept: $kept_begin,)*
+                    $($anew: $anew_begin,)*
+                }
+            }
+
+            /// Takes over what only this process knows from the picture before it, ahead of the rows.
+            pub fn carry_over(&mut self, before: &mut Self) {
+                $(std::mem::swap(&mut self.$kept, &mut before.$kept);)*
+            }
+
+            /// Whether it has the row.
+            pub fn has_row(&self, key: &$crate::rows::Key) -> bool {
+                match key.table {
+                    $($crate::rows::Table::$whole_table => self.$whole.contains_key(&*key.id),)*
+                    $($crate::rows::Table::$part_table => self.$part.contains_key(&*key.id),)*
+                    _ => false,
+                }
+            }
+
+            /// Takes one row as the store has it; none: deleted. What the picture already has is passed over.
+            ///
+            /// # Errors
+            /// A body that is not what its table holds.
+            pub fn take_row(
+                &mut self,
+                key: &$crate::rows::Key,
+                revision: $crate::rows::Revision,
+                row: Option<&$crate::rows::Row>,
+            ) -> Result<(), $crate::rows::BadRow> {
+                use $crate::picture::take;
+                match key.table {
+                    $($crate::rows::Table::$whole_table => take::<Self, $whole_record>(self, &key.id, revision, row),)*
+                    $($crate::rows::Table::$part_table => take::<Self, $part_record>(self, &key.id, revision, row),)*
+                    _ => Ok(()),
+                }
+            }
+        }
+
+        impl $crate::picture::Picture for $name {
+            const WRITER: $crate::rows::Writer = $crate::rows::Writer::$writer;
+            fn unknown_rows(&mut self) -> &mut $crate::unknown_rows::UnknownRows {
+                &mut self.unknown_rows
+            }
+        }
+
+        $($crate::picture::viewed!($name $whole $whole_record $($whole_index)?);)*
+        $($crate::picture::viewed!($name $part $part_record $($part_index)?);)*
+    };
+}
+pub(crate) use picture;
+
+/// Says which field of a picture keeps a record, and whether something is derived from it.
+macro_rules! viewed {
+    ($name:ident $slot:ident $record:ident $($index:ident)?) => {
+        impl $crate::picture::Viewed<$name> for $record {
+            fn slot(picture: &mut $name) -> &mut $crate::picture::Slot<Self> {
+                &mut picture.$slot
+            }
+            $(fn changed(picture: &mut $name, id: &str, old: Option<&Self>) {
+                <$name as $index<Self>>::changed(picture, id, old);
+            })?
+        }
+    };
+}
+pub(crate) use viewed;
 
 /// A row as a picture takes it, from an entry of a log.
 pub fn row_of(entry: &Entry, table: Table) -> Option<Row> {

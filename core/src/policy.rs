@@ -68,7 +68,7 @@ pub struct SoftwareRules {
     pub windows: Vec<Window>,
     /// No new drain of a roll-out begins, and no robot is given permission to change to something new.
     pub frozen: bool,
-    /// The gate on rates of task failures ends a roll-out whose bundle a robot of the area has run, also if its spec does not ask for that. See [`crate::rollout::verdict::acts_on_rates`].
+    /// The gate on rates of task failures ends a roll-out whose bundle a robot of the area has run, also if its spec does not ask for that. See [`crate::rollout::judgement::verdict::acts_on_rates`].
     #[serde(default)]
     pub acts_on_rates: bool,
 }

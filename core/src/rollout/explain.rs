@@ -2,15 +2,18 @@
 //!
 //! Invariant: a moment until which something is waited for lies ahead; what is overdue waits as long as it takes.
 
-use super::rows::{Countdown, Phase, Rollout, RolloutRobot, Step};
-use super::view::View;
-use super::{Board, hear, infrastructure, moves, robots, turns};
+use crate::fleet::Board;
 use crate::fleet::liveness;
 use crate::fleet::rows::{Drain, DrainState};
 use crate::ids::RobotId;
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::Presence;
+use crate::rollout::judgement::infrastructure;
+use crate::rollout::projection::queue;
+use crate::rollout::projection::rows::{Countdown, Phase, Rollout, RolloutRobot, Step};
+use crate::rollout::projection::state::View;
+use crate::rollout::robots::{due, moves};
 use crate::time::{Now, Utc};
 use crate::update::UpdateState;
 
@@ -31,7 +34,7 @@ pub struct Blocked {
 /// What `r` waits for; none: nothing is left to do.
 pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
     let waits = silent(view, board, now, rollout, r).or_else(|| waits_for(view, board, now, rollout, r))?;
-    let by = named(view, board, now, rollout, waits.by);
+    let by = name_robots(view, board, now, rollout, waits.by);
     Some(Blocked { by, deadline: waits.deadline.filter(|deadline| *deadline > now.utc), ..waits })
 }
 
@@ -50,7 +53,7 @@ fn silent(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutR
 }
 
 /// A reason that waits for room, with the robots that have it now.
-fn named(view: &View, board: &Board, now: &Now, rollout: &Rollout, by: Reason) -> Reason {
+fn name_robots(view: &View, board: &Board, now: &Now, rollout: &Rollout, by: Reason) -> Reason {
     let of_rollout = |r: &&RolloutRobot| r.drain_id.is_some() && r.counts();
     let robots: Vec<&RobotId> = match by.code {
         Code::BlockedByBudget => {
@@ -84,8 +87,8 @@ fn named(view: &View, board: &Board, now: &Now, rollout: &Rollout, by: Reason) -
 fn waits_for(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
     let mut since = r.since;
     let mut deadline = None;
-    if let Some(by) = moves::unsigned(view, r)
-        && let Some(due) = robots::next(view, board, now, rollout, r)
+    if let Some(by) = moves::why_unsigned(view, r)
+        && let Some(due) = due::find_move(view, board, now, rollout, r)
         && moves::is_signed(view, rollout, r, &due)
     {
         return Some(Blocked { by, since, deadline });
@@ -94,12 +97,12 @@ fn waits_for(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollo
         Step::Committed | Step::RolledBack | Step::Skipped => return None,
         Step::Waiting if !(rollout.phase.runs() || rollout.phase == Phase::Completed) => Code::BlockedByWave.into(),
         Step::Waiting | Step::Staged => {
-            let by = robots::blocked(view, board, now, rollout, r).unwrap_or_else(|| Code::BlockedByWave.into());
+            let by = due::blocked(view, board, now, rollout, r).unwrap_or_else(|| Code::BlockedByWave.into());
             name_wave(view, rollout, by)
         }
         Step::Staging => {
             deadline =
-                turns::is_on(rollout, r).then(|| turns::turn_came(rollout, r).plus_ms(limits::STAGED_WITHIN.as_ms()));
+                queue::is_on(rollout, r).then(|| queue::turn_came(rollout, r).plus_ms(limits::STAGED_WITHIN.as_ms()));
             let progress =
                 board.get(&r.robot_id).and_then(|l| l.report.update.as_ref()).map_or(0, |u| u.progress_permille);
             Reason::from(Code::BlockedByDownload).with("progress_permille", progress)
@@ -111,7 +114,7 @@ fn waits_for(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollo
             waiting(drain).unwrap_or_else(|| Code::BlockedByDrain.into())
         }
         Step::Activating => {
-            let state = hear::report_of(view, board, r).filter(|u| u.directive >= r.directive).map(|u| u.state);
+            let state = view.report_of(board, r).filter(|u| u.directive >= r.directive).map(|u| u.state);
             match state {
                 Some(UpdateState::Probation) => {
                     since = r.moments.switched.unwrap_or(r.since);
@@ -121,7 +124,7 @@ fn waits_for(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollo
                 _ if r.grant.is_some() => Code::BlockedBySwitch.into(),
                 _ => {
                     deadline = Some(r.since.plus_ms(limits::READY_WITHIN.as_ms()));
-                    let said = hear::report_of(view, board, r).and_then(|u| u.reason.as_ref());
+                    let said = view.report_of(board, r).and_then(|u| u.reason.as_ref());
                     let because = said.and_then(|why| why.metadata.get("by")).cloned().unwrap_or_default();
                     Reason::from(Code::BlockedByRobot).with("by", because)
                 }

@@ -11,7 +11,7 @@ use midshift_core::Boxed;
 use midshift_core::ids::BundleId;
 use midshift_core::limits;
 use midshift_core::privacy;
-use midshift_core::rollout::past;
+use midshift_core::rollout::ended;
 use midshift_core::rollout::rows::{Bundle, Quarantine, RobotSoftware, Rollout};
 use midshift_core::rows::{Expect, Item, Key, Row, Table, Writer};
 use midshift_core::time::{Clock, Now, Utc};
@@ -40,7 +40,7 @@ pub fn prune<'a>(store: &'a dyn Store, clock: &dyn Clock) -> Boxed<'a, Result<u6
 
 /// Of roll-outs that have ended the newest stay.
 async fn prune_rollouts(store: &dyn Store) -> Result<u64, Error> {
-    let ended = Query::all(Table::Rollout).in_states(past::ended_phases());
+    let ended = Query::all(Table::Rollout).in_states(ended::ended_phases());
     let mut query = Query { newest_first: true, ..ended };
     let (mut seen, mut gone) = (0, 0);
     loop {
@@ -51,7 +51,7 @@ async fn prune_rollouts(store: &dyn Store) -> Result<u64, Error> {
         seen += page.len();
         let beyond: Vec<Row> = page.into_iter().skip(stay).collect();
         if !beyond.is_empty() {
-            let named = store.read(&past::naming(), past::named).await?;
+            let named = store.read(&ended::naming(), ended::named).await?;
             let named: BTreeSet<Key> = named.rows.into_iter().map(|row| row.key).collect();
             for row in beyond.into_iter().filter(|row| !named.contains(&row.key)) {
                 gone += forget_rollout(store, row).await?;

@@ -1,59 +1,21 @@
-//! Keeps what is derived from rows: each row that changes brings the queue, deadlines, holders of places and robots to compose up to date.
+//! Keeps what is derived from rows: each row that changes brings the queue, deadlines, holders of places and robots to
+//! compose up to date.
 //!
 //! Invariant: what is derived depends on the rows alone, never on the order in which they came.
 
 use super::queue::{TASKS_PER_TURN, Wait};
-use super::rows::{
-    AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter,
-    ServiceClock, SiteRow, Timer,
-};
+use super::rows::{Drain, HoldToken, Incident, Place, RobotAuthority, RobotControl};
 use super::state::View;
-use crate::identity::RobotIdentity;
 use crate::ids::{RobotId, TaskId};
-use crate::maintenance::{DrainRelease, DrainRequest};
-use crate::picture::{Picture, Slot, Viewed};
+use crate::picture::Indexed;
 use crate::policy::AreaPolicy;
-use crate::rows::Writer;
 use crate::stop::record::StopRecord;
 use crate::task::{Attempt, Phase, TaskIntake, TaskState};
 use crate::time::Utc;
-use crate::unknown_rows::UnknownRows;
-use crate::work::{DesiredPolicy, DesiredWork, LaneMark, Session};
+use crate::work::Session;
 
-impl Picture for View {
-    const WRITER: Writer = Writer::Fleet;
-    fn unknown_rows(&mut self) -> &mut UnknownRows {
-        &mut self.unknown_rows
-    }
-}
-
-macro_rules! viewed {
-    ($($record:ty => $slot:ident;)*) => { $(impl Viewed<View> for $record {
-        fn slot(view: &mut View) -> &mut Slot<Self> { &mut view.$slot }
-    })* };
-}
-
-viewed! {
-    Timer => timers;
-    RobotCounter => counters;
-    SiteRow => sites;
-    DesiredWork => desired_work;
-    DesiredPolicy => desired_policy;
-    ServiceClock => clocks;
-    FleetMark => marks;
-    CommandKey => command_keys;
-    DrainRequest => drain_requests;
-    DrainRelease => drain_releases;
-    AreaBudget => budgets;
-    RobotIdentity => enrolled;
-    LaneMark => lane_marks;
-}
-
-impl Viewed<View> for TaskState {
-    fn slot(view: &mut View) -> &mut Slot<Self> {
-        &mut view.tasks
-    }
-    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+impl Indexed<TaskState> for View {
+    fn changed(view: &mut Self, id: &str, _old: Option<&TaskState>) {
         let Ok(task_id) = TaskId::parse(id) else { return };
         if let Some(task) = view.tasks.get(id).map(|t| &t.row) {
             view.dirty.extend(task.robot_id.clone());
@@ -73,11 +35,8 @@ impl Viewed<View> for TaskState {
     }
 }
 
-impl Viewed<View> for TaskIntake {
-    fn slot(view: &mut View) -> &mut Slot<Self> {
-        &mut view.intakes
-    }
-    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+impl Indexed<TaskIntake> for View {
+    fn changed(view: &mut Self, id: &str, old: Option<&TaskIntake>) {
         let waits_for = view.intakes.get(id).map(|i| i.row.spec.depends_on.clone()).unwrap_or_default();
         for task_id in waits_for {
             let known = view.tasks.get(task_id.as_str()).map(|t| t.row.phase);
@@ -97,34 +56,25 @@ impl Viewed<View> for TaskIntake {
     }
 }
 
-impl Viewed<View> for AreaPolicy {
-    fn slot(view: &mut View) -> &mut Slot<Self> {
-        &mut view.policies
-    }
+impl Indexed<AreaPolicy> for View {
     /// Whoever put it, this process or another: every robot hears of it.
-    fn changed(view: &mut View, _id: &str, _old: Option<&Self>) {
+    fn changed(view: &mut Self, _id: &str, _old: Option<&AreaPolicy>) {
         let robots: Vec<RobotId> = view.sessions.values().map(|s| s.row.robot_id.clone()).collect();
         view.policy_dirty.extend(robots);
     }
 }
 
-impl Viewed<View> for Incident {
-    fn slot(view: &mut View) -> &mut Slot<Self> {
-        &mut view.incidents
-    }
+impl Indexed<Incident> for View {
     /// A person has looked: what was put aside is tried again.
-    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+    fn changed(view: &mut Self, id: &str, _old: Option<&Incident>) {
         if let Some(closed) = view.incidents.get(id).map(|i| &i.row).filter(|i| i.closed.is_some()) {
             view.refused.incident_closed(&closed.reason);
         }
     }
 }
 
-impl Viewed<View> for StopRecord {
-    fn slot(view: &mut View) -> &mut Slot<Self> {
-        &mut view.stops
-    }
-    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+impl Indexed<StopRecord> for View {
+    fn changed(view: &mut Self, id: &str, _old: Option<&StopRecord>) {
         view.closed_places.take();
         view.stops_changed = true;
         match view.stops.get(id).is_some_and(|record| record.row.is_effective()) {
@@ -134,11 +84,8 @@ impl Viewed<View> for StopRecord {
     }
 }
 
-impl Viewed<View> for Drain {
-    fn slot(view: &mut View) -> &mut Slot<Self> {
-        &mut view.drains
-    }
-    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+impl Indexed<Drain> for View {
+    fn changed(view: &mut Self, id: &str, old: Option<&Drain>) {
         match (view.drains.get(id).map(|d| d.row.robot_id.clone()), old) {
             (Some(robot_id), _) => {
                 view.drains_of.entry(robot_id).or_default().insert(id.to_owned());
@@ -153,43 +100,31 @@ impl Viewed<View> for Drain {
     }
 }
 
-impl Viewed<View> for Attempt {
-    fn slot(view: &mut View) -> &mut Slot<Self> {
-        &mut view.attempts
-    }
-    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+impl Indexed<Attempt> for View {
+    fn changed(view: &mut Self, id: &str, _old: Option<&Attempt>) {
         if let Some(attempt) = view.attempts.get(id) {
             view.dirty.insert(attempt.row.robot_id.clone());
         }
     }
 }
 
-impl Viewed<View> for HoldToken {
-    fn slot(view: &mut View) -> &mut Slot<Self> {
-        &mut view.holds
-    }
-    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+impl Indexed<HoldToken> for View {
+    fn changed(view: &mut Self, id: &str, old: Option<&HoldToken>) {
         let robot = view.holds.get(id).map(|h| h.row.robot_id.clone()).or_else(|| old.map(|h| h.robot_id.clone()));
         view.dirty.extend(robot);
     }
 }
 
-impl Viewed<View> for RobotAuthority {
-    fn slot(view: &mut View) -> &mut Slot<Self> {
-        &mut view.authority
-    }
-    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+impl Indexed<RobotAuthority> for View {
+    fn changed(view: &mut Self, id: &str, _old: Option<&RobotAuthority>) {
         view.dirty.extend(view.authority.get(id).map(|a| a.row.robot_id.clone()));
     }
 }
 
-impl Viewed<View> for RobotControl {
-    fn slot(view: &mut View) -> &mut Slot<Self> {
-        &mut view.control
-    }
+impl Indexed<RobotControl> for View {
     /// A person's word about its load goes to the robot, whichever process took it.
-    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
-        let word = |control: &Self| control.load_settled.clone();
+    fn changed(view: &mut Self, id: &str, old: Option<&RobotControl>) {
+        let word = |control: &RobotControl| control.load_settled.clone();
         let new = view.control.get(id).map(|c| &c.row);
         if new.and_then(word) != old.and_then(word) {
             view.dirty.extend(new.map(|control| control.robot_id.clone()));
@@ -197,20 +132,14 @@ impl Viewed<View> for RobotControl {
     }
 }
 
-impl Viewed<View> for Session {
-    fn slot(view: &mut View) -> &mut Slot<Self> {
-        &mut view.sessions
-    }
-    fn changed(view: &mut View, id: &str, _old: Option<&Self>) {
+impl Indexed<Session> for View {
+    fn changed(view: &mut Self, id: &str, _old: Option<&Session>) {
         view.dirty.extend(view.sessions.get(id).map(|s| s.row.robot_id.clone()));
     }
 }
 
-impl Viewed<View> for Place {
-    fn slot(view: &mut View) -> &mut Slot<Self> {
-        &mut view.places
-    }
-    fn changed(view: &mut View, id: &str, old: Option<&Self>) {
+impl Indexed<Place> for View {
+    fn changed(view: &mut Self, id: &str, old: Option<&Place>) {
         view.closed_places.take();
         for robot in old.into_iter().flat_map(|p| &p.holders).map(|h| &h.robot_id) {
             view.dirty.insert(robot.clone());

@@ -1,25 +1,16 @@
 //! Reads rows into the projection: from a snapshot, from the feed, and again after a conflict; lets go of what is over.
 //!
-//! Invariant: a row here is at the revision it has in the store, or one that an item of the running cycle will write. After a conflict the
-//! whole projection is built again; after a refusal only the rows of what was refused are read again.
+//! Invariant: a row here is at the revision it has in the store, or one that an item of the running cycle will write.
+//! After a conflict the whole projection is built again; after a refusal only the rows of what was refused are read
+//! again.
 
 use super::index;
-use super::rows::{
-    AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotCounter,
-    RobotHolder, ServiceClock, SiteRow, Timer,
-};
+use super::rows::{RobotAuthority, RobotHolder};
 use super::state::View;
-use crate::identity::RobotIdentity;
 use crate::ids::TaskId;
 use crate::limits;
-use crate::maintenance::{DrainRelease, DrainRequest};
-use crate::picture::Viewed;
-use crate::policy::AreaPolicy;
 use crate::rows::{BadRow, Key, Part, Revision, Row, Seq, Table};
-use crate::stop::record::StopRecord;
-use crate::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskState};
-use crate::work::{DesiredPolicy, DesiredWork, LaneMark, Session};
-use std::mem::take;
+use crate::task::{AttemptPhase, Phase, TaskIntake, TaskState};
 
 /// What the picture begins with: all that is alive. [`named`] says what is read with it.
 pub fn alive() -> Vec<Part> {
@@ -27,11 +18,11 @@ pub fn alive() -> Vec<Part> {
     let attempts = AttemptPhase::ALL.into_iter().filter(|p| !p.is_terminal()).map(AttemptPhase::number);
     let in_states =
         [Part::InStates(Table::TaskState, tasks.collect()), Part::InStates(Table::Attempt, attempts.collect())];
-    WHOLE.iter().map(|table| Part::Whole(*table)).chain(in_states).collect()
+    View::WHOLE.iter().map(|table| Part::Whole(*table)).chain(in_states).collect()
 }
 
-/// What rows of the picture name: of a task that has not ended what was asked for, its newest attempt, and the tasks that it waits for; of
-/// a robot the attempt that holds it.
+/// What rows of the picture name: of a task that has not ended what was asked for, its newest attempt, and the tasks
+/// that it waits for; of a robot the attempt that holds it.
 pub fn named(rows: &[Row]) -> Vec<Key> {
     let mut keys = Vec::new();
     for row in rows {
@@ -59,31 +50,6 @@ pub fn named(rows: &[Row]) -> Vec<Key> {
     keys
 }
 
-/// Tables that hold only what is alive, or that are bounded by count.
-const WHOLE: &[Table] = &[
-    Table::Timer,
-    Table::HoldToken,
-    Table::PlaceGrant,
-    Table::RobotAuthority,
-    Table::RobotControl,
-    Table::RobotCounter,
-    Table::Site,
-    Table::AreaPolicy,
-    Table::DesiredWork,
-    Table::DesiredPolicy,
-    Table::ServiceClock,
-    Table::FleetMark,
-    Table::Incident,
-    Table::Drain,
-    Table::DrainRequest,
-    Table::DrainRelease,
-    Table::AreaBudget,
-    Table::RobotIdentity,
-    Table::Session,
-    Table::LaneMark,
-    Table::StopRecord,
-];
-
 impl View {
     /// Takes what was read at `seq` by [`alive`] and [`named`].
     ///
@@ -103,30 +69,14 @@ impl View {
         Ok(())
     }
 
-    /// Takes over what only this process knows from the picture before it, ahead of the rows. What is not named here begins anew with each
-    /// reading.
-    pub fn carry_over(&mut self, before: &mut Self) {
-        self.router = before.router.clone();
-        self.place_waits = before.place_waits;
-        self.waits = take(&mut before.waits);
-        self.attached = take(&mut before.attached);
-        self.excused = take(&mut before.excused);
-        self.unwilling = take(&mut before.unwilling);
-        self.answers = take(&mut before.answers);
-        self.unknown = take(&mut before.unknown);
-        self.lasting = take(&mut before.lasting);
-        self.unexplained = take(&mut before.unexplained);
-        self.unusable = take(&mut before.unusable);
-        self.refused = take(&mut before.refused);
-    }
-
     /// What is over and wanted all the same, and nobody has asked the store for: at most [`limits::ASKED_AT_ONCE`].
     pub fn wanted(&self) -> Vec<Key> {
         let ids = self.unasked.iter().take(limits::ASKED_AT_ONCE);
         ids.map(|id| Key::new(Table::TaskState, id.as_str())).collect()
     }
 
-    /// Takes what the store has of `keys`, which were asked by id. What it does not have, or what has not ended, is told by the feed.
+    /// Takes what the store has of `keys`, which were asked by id. What it does not have, or what has not ended, is
+    /// told by the feed.
     ///
     /// # Errors
     /// A row that cannot be read.
@@ -139,7 +89,7 @@ impl View {
         for row in rows {
             match row.key.table {
                 Table::CommandKey => {
-                    crate::picture::take::<Self, CommandKey>(self, &row.key.id, row.revision, Some(row))?;
+                    self.take_row(&row.key, row.revision, Some(row))?;
                 }
                 Table::TaskState => {
                     match row.decode::<TaskState>() {
@@ -155,36 +105,19 @@ impl View {
         Ok(())
     }
 
-    /// Takes one row as the store has it; none: deleted. What this picture already has is passed over.
+    /// Takes one row as the store has it; none: deleted. What this picture already has, or has let go on purpose, is
+    /// passed over.
+    ///
+    /// # Errors
+    /// A row that cannot be read.
     pub fn absorb(&mut self, key: &Key, revision: Revision, row: Option<&Row>) -> Result<(), BadRow> {
-        match key.table {
-            Table::TaskIntake => self.take::<TaskIntake>(key, revision, row),
-            Table::TaskState => self.take::<TaskState>(key, revision, row),
-            Table::Attempt => self.take::<Attempt>(key, revision, row),
-            Table::Timer => self.take::<Timer>(key, revision, row),
-            Table::HoldToken => self.take::<HoldToken>(key, revision, row),
-            Table::PlaceGrant => self.take::<Place>(key, revision, row),
-            Table::RobotAuthority => self.take::<RobotAuthority>(key, revision, row),
-            Table::RobotControl => self.take::<RobotControl>(key, revision, row),
-            Table::RobotCounter => self.take::<RobotCounter>(key, revision, row),
-            Table::Site => self.take::<SiteRow>(key, revision, row),
-            Table::AreaPolicy => self.take::<AreaPolicy>(key, revision, row),
-            Table::DesiredWork => self.take::<DesiredWork>(key, revision, row),
-            Table::DesiredPolicy => self.take::<DesiredPolicy>(key, revision, row),
-            Table::ServiceClock => self.take::<ServiceClock>(key, revision, row),
-            Table::FleetMark => self.take::<FleetMark>(key, revision, row),
-            Table::Incident => self.take::<Incident>(key, revision, row),
-            Table::Drain => self.take::<Drain>(key, revision, row),
-            Table::CommandKey => self.take::<CommandKey>(key, revision, row),
-            Table::RobotIdentity => self.take::<RobotIdentity>(key, revision, row),
-            Table::Session => self.take::<Session>(key, revision, row),
-            Table::LaneMark => self.take::<LaneMark>(key, revision, row),
-            Table::StopRecord => self.take::<StopRecord>(key, revision, row),
-            Table::DrainRequest => self.take::<DrainRequest>(key, revision, row),
-            Table::DrainRelease => self.take::<DrainRelease>(key, revision, row),
-            Table::AreaBudget => self.take::<AreaBudget>(key, revision, row),
-            _ => Ok(()),
+        if let (Table::TaskState, None, Ok(task_id)) = (key.table, row, TaskId::parse(&key.id)) {
+            self.ended.remove(&task_id);
         }
+        if !self.has_row(key) && self.is_past(key) {
+            return Ok(());
+        }
+        self.take_row(key, revision, row)
     }
 
     /// Puts a row as the store has it over what this picture had made of it. None: there is no such row.
@@ -198,16 +131,6 @@ impl View {
         }
         self.absorb(key, Revision(u64::MAX), None)?;
         row.map_or(Ok(()), |row| self.absorb(key, row.revision, Some(row)))
-    }
-
-    fn take<R: Viewed<View>>(&mut self, key: &Key, revision: Revision, row: Option<&Row>) -> Result<(), BadRow> {
-        if let (Table::TaskState, None, Ok(task_id)) = (key.table, row, TaskId::parse(&key.id)) {
-            self.ended.remove(&task_id);
-        }
-        if R::slot(self).get(&*key.id).is_none() && self.is_past(key) {
-            return Ok(());
-        }
-        crate::picture::take::<Self, R>(self, &key.id, revision, row)
     }
 
     /// A row that this picture has let go on purpose, or asks for by id alone.

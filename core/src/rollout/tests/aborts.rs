@@ -1,7 +1,7 @@
 //! The way back: who goes, who stays, and that nothing takes an abort back.
 
-use super::super::spec::AbortScope;
 use super::*;
+use crate::rollout::projection::spec::AbortScope;
 
 #[test]
 fn a_bad_bundle_never_gets_past_its_canary_and_everybody_is_back() {
@@ -63,7 +63,10 @@ fn after_a_hard_stop_robots_leave_work_at_once_and_after_a_number_as_the_budget_
         if hard {
             let class = crate::robot::FaultClass::Recoverable;
             let n = rig.order()[3];
-            rig.say(n, RobotEvent::Fault { fault: Fault { code: 66, class, message: String::new() }, cleared: false });
+            rig.say_event(
+                n,
+                RobotEvent::Fault { fault: Fault { code: 66, class, message: String::new() }, cleared: false },
+            );
         } else {
             rig.verb("ro", Verb::Abort).expect("allowed");
         }
@@ -136,7 +139,7 @@ fn all_dark_on_probation() -> (Rig, usize) {
     rig.start(spec());
     let n = rig.order()[0];
     rig.robots[n].fate = Fate::Probation;
-    rig.until(60, |r| r.of("ro", n).moments.switched.is_some());
+    rig.until(60, |r| r.robot_in("ro", n).moments.switched.is_some());
     rig.robots.iter_mut().for_each(|r| r.is_off = true);
     rig.ticks(310);
     (rig, n)
@@ -145,8 +148,8 @@ fn all_dark_on_probation() -> (Rig, usize) {
 #[test]
 fn a_silent_network_pauses_and_is_nobodys_failure() {
     let (mut rig, n) = all_dark_on_probation();
-    assert!(rig.rollout("ro").pauses.contains(&super::super::rows::Pause::Infrastructure));
-    assert_eq!(rig.of("ro", n).failure, None);
+    assert!(rig.rollout("ro").pauses.contains(&crate::rollout::projection::rows::Pause::Infrastructure));
+    assert_eq!(rig.robot_in("ro", n).failure, None);
     rig.robots.iter_mut().for_each(|r| (r.is_off, r.fate) = (false, Fate::Good));
     rig.until(300, |r| r.phase() == Phase::Completed);
     assert!(rig.ota.quarantines.is_empty());
@@ -161,11 +164,11 @@ fn a_network_that_comes_back_for_the_others_first_burns_no_bundle() {
         rig.attach(other, |_| {});
     }
     rig.ticks(2);
-    assert!(rig.rollout("ro").pauses.contains(&super::super::rows::Pause::Infrastructure));
-    assert_eq!(rig.of("ro", n).failure, None, "they were missed as long as it was");
-    rig.until(600, |r| r.of("ro", n).failure.is_some());
+    assert!(rig.rollout("ro").pauses.contains(&crate::rollout::projection::rows::Pause::Infrastructure));
+    assert_eq!(rig.robot_in("ro", n).failure, None, "they were missed as long as it was");
+    rig.until(600, |r| r.robot_in("ro", n).failure.is_some());
     assert_eq!(
-        rig.of("ro", n).failure.map(|f| f.code),
+        rig.robot_in("ro", n).failure.map(|f| f.code),
         Some(Code::RobotLost),
         "the others keep contact and it does not come"
     );
@@ -177,12 +180,12 @@ fn too_few_others_to_compare_with_pause_it_too() {
     rig.fates(Fate::Silent);
     rig.start(spec());
     rig.ticks(330);
-    assert!(rig.rollout("ro").pauses.contains(&super::super::rows::Pause::InfrastructureUnknown));
+    assert!(rig.rollout("ro").pauses.contains(&crate::rollout::projection::rows::Pause::InfrastructureUnknown));
 }
 
 #[test]
 fn a_lost_robot_is_taken_back_until_the_gate_of_its_wave_closes() {
-    let review = super::super::spec::SmallWaveFailure::Review;
+    let review = crate::rollout::projection::spec::SmallWaveFailure::Review;
     for late in [false, true] {
         let mut rig = Rig::new(16);
         rig.start(RolloutSpec {
@@ -193,8 +196,8 @@ fn a_lost_robot_is_taken_back_until_the_gate_of_its_wave_closes() {
         });
         let n = rig.order()[0];
         rig.robots[n].fate = Fate::Silent;
-        rig.until(600, |r| r.of("ro", n).failure.is_some());
-        assert_eq!(rig.of("ro", n).failure.expect("lost").code, Code::RobotLost);
+        rig.until(600, |r| r.robot_in("ro", n).failure.is_some());
+        assert_eq!(rig.robot_in("ro", n).failure.expect("lost").code, Code::RobotLost);
         if late {
             // The wave goes on without it to its gate, and a person promotes it.
             rig.until(100, |r| r.phase() == Phase::Review);
@@ -206,9 +209,9 @@ fn a_lost_robot_is_taken_back_until_the_gate_of_its_wave_closes() {
         rig.robots[n].version = "2.0.0".into();
         rig.attach(n, |_| {});
         let grant_id = rig.robots[n].seen_grant;
-        rig.tell(n, UpdateReport { state: UpdateState::Probation, grant_id, ..set });
+        rig.report_update(n, UpdateReport { state: UpdateState::Probation, grant_id, ..set });
         rig.ticks(2);
-        assert_eq!(rig.of("ro", n).failure.is_some(), late);
+        assert_eq!(rig.robot_in("ro", n).failure.is_some(), late);
         if late {
             rig.until(60, |r| r.step(n) == Step::RolledBack);
         } else {
@@ -227,8 +230,8 @@ fn a_robot_that_goes_dark_on_trial_is_never_called_clean_and_counts_as_lost_if_o
     rig.until(600, |r| r.phase().goes_back());
     let row = rig.rollout("ro");
     assert_eq!((row.promoted, row.abort.map(|a| a.robots)), (0, Some(vec![robot_id(n)])));
-    assert_eq!(rig.of("ro", n).failure.expect("lost").code, Code::RobotLost);
-    assert!(rig.order()[1..].iter().all(|other| !rig.of("ro", *other).attempted), "nobody came behind it");
+    assert_eq!(rig.robot_in("ro", n).failure.expect("lost").code, Code::RobotLost);
+    assert!(rig.order()[1..].iter().all(|other| !rig.robot_in("ro", *other).attempted), "nobody came behind it");
 }
 
 #[test]
@@ -259,7 +262,7 @@ fn robots_that_were_off_before_say_nothing_of_the_network() {
     let n = rig.order()[0];
     rig.robots[n].fate = Fate::Silent;
     rig.until(600, |r| r.phase().goes_back());
-    assert_eq!(rig.of("ro", n).failure.expect("lost").code, Code::RobotLost);
+    assert_eq!(rig.robot_in("ro", n).failure.expect("lost").code, Code::RobotLost);
 }
 
 #[test]
@@ -270,15 +273,15 @@ fn a_robot_that_did_not_reach_its_server_burns_no_bundle_unless_it_was_lost_alon
         let n = rig.order()[0];
         rig.robots[n].fate = Fate::Silent;
         if alone {
-            rig.until(600, |r| r.of("ro", n).failure.is_some());
+            rig.until(600, |r| r.robot_in("ro", n).failure.is_some());
         } else {
-            rig.until(60, |r| r.step(n) == Step::Activating && r.of("ro", n).grant.is_some());
+            rig.until(60, |r| r.step(n) == Step::Activating && r.robot_in("ro", n).grant.is_some());
             rig.ticks(20);
         }
         rig.robots[n].is_off = false;
         rig.goes_back(n, Some(Code::LostServer));
         rig.until(60, |r| r.step(n) == Step::RolledBack);
-        assert_eq!((rig.of("ro", n).failure.is_some(), !rig.ota.quarantines.is_empty()), (alone, alone));
+        assert_eq!((rig.robot_in("ro", n).failure.is_some(), !rig.ota.quarantines.is_empty()), (alone, alone));
     }
 }
 
@@ -288,16 +291,16 @@ fn an_abort_waits_for_permissions_on_the_link_clock_however_fast_the_site_is() {
     rig.start(spec());
     let n = rig.order()[0];
     rig.robots[n].fate = Fate::Silent;
-    rig.until(20, |r| r.of("ro", n).grant.is_some());
+    rig.until(20, |r| r.robot_in("ro", n).grant.is_some());
     rig.robots[n].is_off = true;
     rig.must("ro", Verb::Abort);
     // Ten minutes of the site in a second of the link.
     rig.now.site.0 += 600_000;
     rig.now.utc = rig.now.utc.plus_ms(600_000);
     rig.tick();
-    assert_eq!((rig.phase(), rig.of("ro", n).step), (Phase::Aborting, Step::Activating));
+    assert_eq!((rig.phase(), rig.robot_in("ro", n).step), (Phase::Aborting, Step::Activating));
     rig.ticks(50);
     assert_eq!(rig.phase(), Phase::Aborting);
     rig.until(20, |r| r.phase() != Phase::Aborting);
-    assert_eq!(rig.of("ro", n).step, Step::Activating, "it keeps its drain");
+    assert_eq!(rig.robot_in("ro", n).step, Step::Activating, "it keeps its drain");
 }

@@ -4,7 +4,7 @@ use super::*;
 
 impl Rig {
     /// A robot's event is stored.
-    pub(super) fn say(&mut self, n: usize, event: RobotEvent) {
+    pub(super) fn say_event(&mut self, n: usize, event: RobotEvent) {
         let robot = &mut self.robots[n];
         robot.events += 1;
         let (id, epoch, seq) = (robot.id.clone(), robot.epoch, robot.events);
@@ -25,12 +25,12 @@ impl Rig {
     /// A robot's update is in this state from now on.
     pub(super) fn report(&mut self, n: usize, state: UpdateState) {
         let Some(report) = self.robots[n].report.clone() else { panic!("it has no update") };
-        self.tell(n, UpdateReport { state, ..report });
+        self.report_update(n, UpdateReport { state, ..report });
     }
 
-    pub(super) fn tell(&mut self, n: usize, report: UpdateReport) {
+    pub(super) fn report_update(&mut self, n: usize, report: UpdateReport) {
         self.robots[n].report = Some(report.clone());
-        self.say(n, RobotEvent::Update(UpdateEvent::Changed(report)));
+        self.say_event(n, RobotEvent::Update(UpdateEvent::Changed(report)));
     }
 
     pub(super) fn robots_act(&mut self) {
@@ -76,7 +76,7 @@ impl Rig {
                 return self.refuses(n, &desired, Code::DirectiveRefused);
             }
             if desired.goal == Goal::Revert && robot.version != "0.9.0" {
-                self.tell(n, fresh_report(UpdateState::Committed, &bundle, generation));
+                self.report_update(n, fresh_report(UpdateState::Committed, &bundle, generation));
             }
             if matches!(desired.goal, Goal::Stage | Goal::Activate) {
                 let (state, reason) = match robot.fate {
@@ -86,7 +86,7 @@ impl Rig {
                     _ => (UpdateState::Staged, None),
                 };
                 let grant_id = robot.seen_grant;
-                self.tell(n, UpdateReport { reason, grant_id, ..fresh_report(state, &bundle, generation) });
+                self.report_update(n, UpdateReport { reason, grant_id, ..fresh_report(state, &bundle, generation) });
             }
             return;
         }
@@ -118,7 +118,7 @@ impl Rig {
     fn refuses(&mut self, n: usize, desired: &DesiredUpdate, why: Code) {
         self.robots[n].judged.clone_from(&desired.directive);
         let (generation, reason) = (desired.generation, why.into());
-        self.say(n, RobotEvent::Update(UpdateEvent::DirectiveRefused { generation, reason }));
+        self.say_event(n, RobotEvent::Update(UpdateEvent::DirectiveRefused { generation, reason }));
     }
 
     pub(super) fn activates(
@@ -153,13 +153,13 @@ impl Rig {
                     tries: 1,
                     ..report
                 };
-                self.tell(n, switched);
+                self.report_update(n, switched);
             }
             // It asks again every few seconds.
             None if !robot.hb.is_multiple_of(3) => {}
             None => {
                 let set = crate::ids::SetId::parse(&"a".repeat(64)).expect("an id");
-                self.say(n, RobotEvent::Update(UpdateEvent::Ready { drain_id, set }));
+                self.say_event(n, RobotEvent::Update(UpdateEvent::Ready { drain_id, set }));
             }
         }
     }
@@ -172,7 +172,7 @@ impl Rig {
         let report = robot.report.clone().expect("an update");
         self.attach(n, |_| {});
         let reason = why.map(Reason::from);
-        self.tell(n, UpdateReport { state: UpdateState::RolledBack, reason, ..report });
+        self.report_update(n, UpdateReport { state: UpdateState::RolledBack, reason, ..report });
     }
 
     /// A task of the robot ends.

@@ -13,12 +13,12 @@ impl Rig {
         self.row(id).expect("a roll-out")
     }
 
-    pub(super) fn of(&self, id: &str, n: usize) -> RolloutRobot {
+    pub(super) fn robot_in(&self, id: &str, n: usize) -> RolloutRobot {
         self.row(&RolloutRobot::id_of(&rollout_id(id), &robot_id(n))).expect("a robot of it")
     }
 
     pub(super) fn step(&self, n: usize) -> Step {
-        self.of("ro", n).step
+        self.robot_in("ro", n).step
     }
 
     pub(super) fn phase(&self) -> Phase {
@@ -74,9 +74,9 @@ impl Rig {
 
     pub(super) fn ask(&mut self, command: &Command) -> Result<bool, Refusal> {
         self.ota_turn();
-        let done = commands::check(&self.ota, &self.board, command, None)?;
+        let done = check_command(&self.ota, &self.board, command, None)?;
         if !done {
-            self.ota_plan(|rig, plan| commands::apply(&mut rig.ota, &rig.board, rig.now, command, &"ana".into(), plan));
+            self.ota_plan(|rig, plan| carry_out(&mut rig.ota, &rig.board, rig.now, command, &"ana".into(), plan));
         }
         Ok(done)
     }

@@ -20,17 +20,17 @@ fn permission_is_given_only_while_the_drain_holds_the_robot_and_the_roll_out_run
     rig.start(spec());
     let n = rig.order()[0];
     rig.until(20, |r| r.step(n) == Step::Draining);
-    let drain_id = rig.of("ro", n).drain_id.expect("a drain");
+    let drain_id = rig.robot_in("ro", n).drain_id.expect("a drain");
     let set = crate::ids::SetId::parse("factory").expect("an id");
-    rig.say(n, RobotEvent::Update(UpdateEvent::Ready { drain_id: drain_id.clone(), set: set.clone() }));
+    rig.say_event(n, RobotEvent::Update(UpdateEvent::Ready { drain_id: drain_id.clone(), set: set.clone() }));
     rig.ticks(3);
-    assert!(rig.of("ro", n).grant.is_none(), "the drain does not hold it");
+    assert!(rig.robot_in("ro", n).grant.is_none(), "the drain does not hold it");
     rig.fleet_sleeps = false;
     rig.until(20, |r| r.step(n) == Step::Activating);
     rig.must("ro", Verb::Pause);
-    rig.say(n, RobotEvent::Update(UpdateEvent::Ready { drain_id, set }));
+    rig.say_event(n, RobotEvent::Update(UpdateEvent::Ready { drain_id, set }));
     rig.ticks(3);
-    assert!(rig.of("ro", n).grant.is_none(), "the roll-out stands still");
+    assert!(rig.robot_in("ro", n).grant.is_none(), "the roll-out stands still");
     assert_eq!(rig.step(n), Step::Staged, "it works on meanwhile");
     assert_eq!(rig.rollout("ro").in_flight, 0);
 }
@@ -42,16 +42,16 @@ fn a_word_of_an_older_drain_gets_no_permission() {
     let n = rig.order()[0];
     rig.robots[n].fate = Fate::NeverReady;
     rig.until(20, |r| r.step(n) == Step::Activating);
-    let old = rig.of("ro", n).drain_id.expect("a drain");
+    let old = rig.robot_in("ro", n).drain_id.expect("a drain");
     rig.must("ro", Verb::Pause);
     rig.ticks(3);
     rig.must("ro", Verb::Resume);
     rig.until(20, |r| r.step(n) == Step::Activating);
-    assert_ne!(rig.of("ro", n).drain_id, Some(old.clone()), "ids are never used again");
+    assert_ne!(rig.robot_in("ro", n).drain_id, Some(old.clone()), "ids are never used again");
     let set = crate::ids::SetId::parse("factory").expect("an id");
-    rig.say(n, RobotEvent::Update(UpdateEvent::Ready { drain_id: old, set }));
+    rig.say_event(n, RobotEvent::Update(UpdateEvent::Ready { drain_id: old, set }));
     rig.ticks(3);
-    assert!(rig.of("ro", n).grant.is_none());
+    assert!(rig.robot_in("ro", n).grant.is_none());
 }
 
 #[test]
@@ -60,24 +60,24 @@ fn an_unused_permission_is_taken_back_only_when_the_robot_says_so_past_its_life(
     rig.start(spec());
     let n = rig.order()[0];
     rig.robots[n].fate = Fate::Dawdles;
-    rig.until(20, |r| r.of("ro", n).grant.is_some());
-    let given = rig.of("ro", n).grant.expect("given").grant_id;
+    rig.until(20, |r| r.robot_in("ro", n).grant.is_some());
+    let given = rig.robot_in("ro", n).grant.expect("given").grant_id;
     rig.must("ro", Verb::Pause);
     rig.robots[n].is_off = true;
     rig.ticks(60);
-    assert!(rig.of("ro", n).drain_id.is_some(), "time alone releases nothing");
+    assert!(rig.robot_in("ro", n).drain_id.is_some(), "time alone releases nothing");
     assert!(rig.releases().is_empty());
     rig.robots[n].is_off = false;
     rig.ticks(2);
-    assert!(rig.of("ro", n).grant.is_some(), "its heartbeats are not past its life yet");
+    assert!(rig.robot_in("ro", n).grant.is_some(), "its heartbeats are not past its life yet");
     rig.ticks(10);
-    assert_eq!(rig.of("ro", n).grant, None);
+    assert_eq!(rig.robot_in("ro", n).grant, None);
     rig.ticks(2);
     assert_eq!(rig.releases(), [ReleasedBy::NotUsed]);
     rig.robots[n].fate = Fate::Good;
     rig.must("ro", Verb::Resume);
     rig.until(60, |r| r.step(n) == Step::Trial);
-    assert!(rig.of("ro", n).moments.switched.is_some() && rig.robots[n].seen_grant > given);
+    assert!(rig.robot_in("ro", n).moments.switched.is_some() && rig.robots[n].seen_grant > given);
 }
 
 #[test]
@@ -91,7 +91,7 @@ fn a_robot_that_was_killed_between_its_ledger_and_its_switch_record_gets_another
     let staged = rig.robots[n].report.clone().expect("has staged");
     // Its ledger says that it took it; its record, that it did not switch.
     rig.attach(n, |_| {});
-    rig.tell(n, UpdateReport { grant_id: given, ..staged });
+    rig.report_update(n, UpdateReport { grant_id: given, ..staged });
     rig.robots[n].fate = Fate::Good;
     rig.until(60, |r| r.step(n) == Step::Trial);
     assert!(rig.robots[n].seen_grant > given, "never the same twice");
@@ -115,7 +115,7 @@ fn a_robot_that_says_it_has_used_what_no_clock_gave_moves_no_number() {
     let n = rig.order()[0];
     let used = crate::limits::GENERATION_FOLLOWED_MAX;
     rig.robots[n].seen_grant = used;
-    rig.until(30, |r| r.of("ro", n).grant.is_some());
+    rig.until(30, |r| r.robot_in("ro", n).grant.is_some());
     assert_eq!(rig.robots[n].report.as_ref().map(|report| report.grant_id), Some(used));
     let number = rig.ota.clocks["ota"].row.number;
     assert!(number <= rig.now.wall.0.cast_unsigned() + 10, "{number}");
@@ -389,7 +389,7 @@ fn a_drain_behind_one_of_a_person_is_given_up_after_an_hour() {
     assert_eq!(rig.step(n), Step::Draining);
     rig.pass(crate::limits::STAGED_WITHIN.as_ms());
     rig.turn();
-    let r = rig.of("ro", n);
+    let r = rig.robot_in("ro", n);
     assert_eq!((r.step, r.why.expect("a reason").code), (Step::Skipped, Code::SkippedBusy));
     assert_eq!(rig.releases(), [ReleasedBy::NoGrant]);
 }

@@ -1,7 +1,7 @@
 //! How roll-outs end that nothing ended early: with their bundle on as many robots as was asked, or not.
 
-use super::super::rows::Ending;
 use super::*;
+use crate::rollout::projection::rows::Ending;
 
 fn outcome(rig: &Rig, id: &str) -> Option<Ending> {
     rig.rollout(id).outcome
@@ -99,6 +99,6 @@ fn one_that_takes_another_back_is_complete_once_enough_went_back() {
     rig.until(200, |r| r.rollout("back").phase == Phase::Completed);
     assert_eq!(outcome(&rig, "back"), Some(Ending::Incomplete));
     rig.robots[3].is_off = false;
-    rig.until(60, |r| r.of("back", 3).step == Step::RolledBack);
+    rig.until(60, |r| r.robot_in("back", 3).step == Step::RolledBack);
     assert_eq!(outcome(&rig, "back"), Some(Ending::Complete));
 }

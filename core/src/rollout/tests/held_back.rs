@@ -1,4 +1,5 @@
-//! A shut window, a freeze, a pause, a revoke and an abort hold robots that change to something new, at every step, and nobody else.
+//! A shut window, a freeze, a pause, a revoke and an abort hold robots that change to something new, at every step, and
+//! nobody else.
 
 use super::*;
 use crate::policy::Window;
@@ -46,8 +47,8 @@ impl Rig {
     }
 
     fn waits_for(&self, n: usize) -> Option<Code> {
-        let (rollout, r) = (self.rollout("ro"), self.of("ro", n));
-        super::super::explain::blocked(&self.ota, &self.board, &self.now, &rollout, &r).map(|blocked| blocked.by.code)
+        let (rollout, r) = (self.rollout("ro"), self.robot_in("ro", n));
+        crate::rollout::explain::blocked(&self.ota, &self.board, &self.now, &rollout, &r).map(|blocked| blocked.by.code)
     }
 }
 
@@ -202,7 +203,7 @@ fn what_was_asked_of_fleet_is_taken_back_in_the_item_that_ends_it_as_far_as_one_
         rig.until(30, |r| r.count(Step::Draining) == 80);
         rig.ota_turn();
         let mut plan = Plan::default();
-        commands::apply(&mut rig.ota, &rig.board, rig.now, &command, &"ana".into(), &mut plan);
+        carry_out(&mut rig.ota, &rig.board, rig.now, &command, &"ana".into(), &mut plan);
         let [item] = &plan.items[..] else { panic!("{hold:?}: one item") };
         let taken_back = item.rows.iter().filter(|row| row.kind == "drain.release").count();
         assert!((60..80).contains(&taken_back), "{hold:?}: {taken_back}");

@@ -14,8 +14,8 @@ fn has_work(rig: &mut Rig, n: usize, gets_on: bool) {
     (live.report.attempts, live.progress_at) = (vec![listed], progress_at);
 }
 
-/// One canary on trial that stands with its work, held by a stop or waiting for a place or neither, and five others with work, of which so many get
-/// on, for as long as a jam takes.
+/// One canary on trial that stands with its work, held by a stop or waiting for a place or neither, and five others
+/// with work, of which so many get on, for as long as a jam takes.
 fn stands(others_get_on: usize, held: bool, waits: bool) -> (Rig, usize) {
     let mut rig = Rig::new(6);
     rig.works = false;
@@ -44,7 +44,7 @@ fn stands(others_get_on: usize, held: bool, waits: bool) -> (Rig, usize) {
 #[test]
 fn a_canary_that_stands_with_its_work_while_others_get_on_fails_its_trial() {
     let (rig, n) = stands(5, false, false);
-    assert_eq!(rig.of("ro", n).failure.map(|f| f.code), Some(Code::JammedOnTrial));
+    assert_eq!(rig.robot_in("ro", n).failure.map(|f| f.code), Some(Code::JammedOnTrial));
     assert!(rig.rollout("ro").abort.is_some_and(|abort| abort.reason.code == Code::FailureAmongFew));
 }
 
@@ -52,6 +52,6 @@ fn a_canary_that_stands_with_its_work_while_others_get_on_fails_its_trial() {
 fn where_the_others_stand_too_or_a_stop_or_a_place_holds_it_nothing_is_held_against_the_bundle() {
     for (others_get_on, held, waits) in [(3, false, false), (0, false, false), (5, true, false), (5, false, true)] {
         let (rig, n) = stands(others_get_on, held, waits);
-        assert_eq!(rig.of("ro", n).failure, None, "{others_get_on} {held} {waits}");
+        assert_eq!(rig.robot_in("ro", n).failure, None, "{others_get_on} {held} {waits}");
     }
 }

@@ -1,13 +1,14 @@
-//! A server without a key whose orders robots take: it tells nobody what would have to be signed, says why, and goes on when it has one.
+//! A server without a key whose orders robots take: it tells nobody what would have to be signed, says why, and goes on
+//! when it has one.
 
-use super::super::explain;
-use super::super::rows::Pause;
 use super::*;
+use crate::rollout::explain;
+use crate::rollout::projection::rows::Pause;
 
 /// What a robot waits for, as whoever asks is told.
 fn waits_for(rig: &Rig, n: usize) -> Option<Code> {
     let rollout = rig.rollout("ro");
-    explain::blocked(&rig.ota, &rig.board, &rig.now, &rollout, &rig.of("ro", n)).map(|blocked| blocked.by.code)
+    explain::blocked(&rig.ota, &rig.board, &rig.now, &rollout, &rig.robot_in("ro", n)).map(|blocked| blocked.by.code)
 }
 
 #[test]
@@ -42,10 +43,7 @@ fn a_roll_out_at_work_stands_still_and_no_more_robots_come_out_of_work() {
 
 #[test]
 fn robots_go_back_by_the_order_that_they_took_also_without_a_key() {
-    let mut rig = Rig::new(4);
-    rig.start(spec());
-    let n = rig.order()[0];
-    rig.until(60, |r| r.step(n) == Step::Trial);
+    let (mut rig, n) = canary_on_trial();
     rig.keyless = true;
     rig.must("ro", Verb::Abort);
     rig.until(60, |r| r.phase() == Phase::Aborted);
@@ -54,13 +52,7 @@ fn robots_go_back_by_the_order_that_they_took_also_without_a_key() {
 
 #[test]
 fn an_order_back_that_must_be_signed_anew_waits_for_a_key_and_nothing_else_does() {
-    let mut rig = Rig::new(4);
-    rig.start(spec());
-    let n = rig.order()[0];
-    rig.until(60, |r| r.step(n) == Step::Trial);
-    rig.must("ro", Verb::Abort);
-    rig.robots[n].is_off = true;
-    rig.until(60, |r| r.step(n) == Step::Reverting);
+    let (mut rig, n) = canary_on_its_way_back();
     rig.keyless = true;
     // What it was told is gone, as after a restore: only a directive of its own can tell it again.
     let told = rig.ota.desired[robot_id(n).as_str()].row.generation;

@@ -1,25 +1,26 @@
-//! Roll-outs over rows in memory: the real planner of roll-outs, fleet's real drains and budgets, and robots that obey their section
-//! `update` as agents do, one second at a time.
+//! Roll-outs over rows in memory: the real planner of roll-outs, fleet's real drains and budgets, and robots that obey
+//! their section `update` as agents do, one second at a time.
 //!
-//! Invariant: every item finds its rows as it expects them, and after each turn a picture built from the rows equals the one that was kept.
+//! Invariant: every item finds its rows as it expects them, and after each turn a picture built from the rows equals
+//! the one that was kept.
 
 mod aborts;
 mod agents;
 mod asks;
 mod drains_and_grants;
+mod ended;
 mod endings;
 mod held_back;
 mod jams;
 mod keyless;
 mod lost;
-mod named;
 mod newcomers_and_pins;
 mod once;
-mod past;
 mod people;
 mod reach;
 mod recovery;
 mod refusals;
+mod retention;
 mod reverts_and_second_pass;
 mod sequences;
 mod staging;
@@ -28,13 +29,8 @@ mod trial_and_gates;
 mod waves_and_matching;
 mod ways_back;
 
-use super::commands;
-use super::requests::{Command, Verb};
-use super::rows::{AreaBundle, Bundle, Outcome, Phase, RobotSoftware, Rollout, RolloutRobot, Step};
-use super::spec::{RolloutSpec, Wave};
-use super::view::{Slot, View, WHOLE};
-use super::{Board, Order, Plan, Sign, absorb, cycle};
 use crate::fleet;
+use crate::fleet::Board;
 use crate::fleet::maintenance::{budget, drain};
 use crate::fleet::rows::{
     DrainState, HolderState, Place, PlaceHolder, RobotAuthority, RobotControl, RobotCounter, RobotHolder,
@@ -44,6 +40,18 @@ use crate::maintenance::ReleasedBy;
 use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason, Refusal};
 use crate::robot::{Fault, HardwareStop, Inventory, Lane, Load, ReportedState, Vitals};
+use crate::rollout::commands::carry_out::{carry_out, decide_request};
+use crate::rollout::commands::check::check_command;
+use crate::rollout::decision::directive::{Order, Sign};
+use crate::rollout::decision::plan::Plan;
+use crate::rollout::projection::requests::{Command, Verb};
+use crate::rollout::projection::rows::{
+    AreaBundle, Bundle, Outcome, Phase, RobotSoftware, Rollout, RolloutRobot, Step,
+};
+use crate::rollout::projection::spec::{RolloutSpec, Wave};
+use crate::rollout::projection::{Slot, View};
+use crate::rollout::robots::{due, machine};
+use crate::rollout::{absorb, cycle};
 use crate::rows::{Entry, Expect, Item, Key, Log, Record, Revision, Row, Seq, Table, Write};
 use crate::site::{DEMO, Site};
 use crate::time::{LinkTime, Now, SiteTime, Utc};
@@ -453,7 +461,7 @@ impl Rig {
     fn rebuilt(&self) -> View {
         let mut view = View::new(self.ota.site.clone(), self.ota.started, self.now);
         let is_read = |table| {
-            WHOLE.contains(&table) || matches!(table, Table::Rollout | Table::RolloutRobot | Table::OtaCommandKey)
+            View::WHOLE.contains(&table) || matches!(table, Table::Rollout | Table::RolloutRobot | Table::OtaCommandKey)
         };
         let rows: Vec<Row> = self.rows.values().filter(|row| is_read(row.key.table)).cloned().collect();
         view.load(&rows, Seq(self.seq)).expect("rows read");
@@ -490,7 +498,10 @@ impl Rig {
             let counted = self.ota.robots_of(&rollout.rollout_id).filter(|r| r.drain_id.is_some() && r.counts());
             assert_eq!(rollout.in_flight as usize, counted.count(), "in flight");
             for r in self.ota.robots_of(&rollout.rollout_id) {
-                let waits = super::explain::blocked(&self.ota, &self.board, &self.now, rollout, r);
+                let due = due::find_move(&self.ota, &self.board, &self.now, rollout, r);
+                let is_in_table = due.as_ref().is_none_or(|due| machine::next(r.step, due).is_some());
+                assert!(is_in_table, "{due:?} at {:?}", r.step);
+                let waits = crate::rollout::explain::blocked(&self.ota, &self.board, &self.now, rollout, r);
                 let until = waits.as_ref().and_then(|waits| waits.deadline);
                 assert!(until.is_none_or(|until| until > self.now.utc), "{} waits for the past: {waits:?}", r.robot_id);
             }
@@ -558,4 +569,22 @@ fn spec() -> RolloutSpec {
         exposure_within_ms: 60_000,
         ..RolloutSpec::new(bundle_id(2))
     }
+}
+
+/// Four robots of which the canary works with the bundle, and its number.
+fn canary_on_trial() -> (Rig, usize) {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let n = rig.order()[0];
+    rig.until(60, |r| r.step(n) == Step::Trial);
+    (rig, n)
+}
+
+/// The same, after an abort: the canary is to go back, and is not heard.
+fn canary_on_its_way_back() -> (Rig, usize) {
+    let (mut rig, n) = canary_on_trial();
+    rig.must("ro", Verb::Abort);
+    rig.robots[n].is_off = true;
+    rig.until(60, |r| r.step(n) == Step::Reverting);
+    (rig, n)
 }

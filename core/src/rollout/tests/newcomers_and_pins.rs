@@ -9,6 +9,16 @@ fn done(rig: &mut Rig, spec: RolloutSpec) {
     rig.ticks(4);
 }
 
+/// The canary may ask to activate and does not; the next robot has the bundle.
+fn canary_activating() -> (Rig, usize, usize) {
+    let mut rig = Rig::new(4);
+    rig.start(spec());
+    let (canary, other) = (rig.order()[0], rig.order()[1]);
+    rig.robots[canary].fate = Fate::NeverReady;
+    rig.until(20, |r| r.step(canary) == Step::Activating && r.step(other) == Step::Staged);
+    (rig, canary, other)
+}
+
 #[test]
 fn who_comes_after_gets_the_bundle_too_one_by_one() {
     let mut rig = Rig::new(4);
@@ -81,7 +91,7 @@ fn newcomers_on_their_way_do_not_get_a_bundle_that_was_taken_back() {
     rig.ask(&Command::Revoke { bundle: bundle_id(2), reason: "leaks".into() }).expect("allowed");
     rig.robots[4].fate = Fate::Good;
     rig.ticks(10);
-    let r = rig.of("ro", 4);
+    let r = rig.robot_in("ro", 4);
     assert_eq!((r.step, r.attempted, r.why.expect("a reason").code), (Step::Skipped, false, Code::BundleRevoked));
     assert_eq!(rig.rollout("ro").in_flight, 0);
 }
@@ -101,17 +111,13 @@ fn a_newcomer_that_falls_silent_gets_it_when_it_is_back() {
 
 #[test]
 fn a_robot_that_is_pinned_stays_at_what_it_runs_however_far_it_is() {
-    let mut rig = Rig::new(4);
-    rig.start(spec());
-    let (canary, other) = (rig.order()[0], rig.order()[1]);
-    rig.robots[canary].fate = Fate::NeverReady;
-    rig.until(20, |r| r.step(canary) == Step::Activating && r.step(other) == Step::Staged);
+    let (mut rig, canary, other) = canary_activating();
     for n in [canary, other] {
         rig.ask(&Command::Pin { robot_id: robot_id(n), reason: "a trade fair".into() }).expect("allowed");
     }
     rig.until(300, |r| r.phase() == Phase::Completed);
     for n in [canary, other] {
-        assert_eq!(rig.of("ro", n).why.expect("a reason").code, Code::SkippedPinned);
+        assert_eq!(rig.robot_in("ro", n).why.expect("a reason").code, Code::SkippedPinned);
         assert_eq!(rig.robots[n].version, "0.9.0");
     }
     assert_eq!(rig.robots.iter().filter(|r| r.version == "2.0.0").count(), 2);
@@ -119,17 +125,13 @@ fn a_robot_that_is_pinned_stays_at_what_it_runs_however_far_it_is() {
 
 #[test]
 fn a_robot_that_shows_another_device_key_and_was_not_enrolled_since_gets_nothing_however_far_it_is() {
-    let mut rig = Rig::new(4);
-    rig.start(spec());
-    let (canary, other) = (rig.order()[0], rig.order()[1]);
-    rig.robots[canary].fate = Fate::NeverReady;
-    rig.until(20, |r| r.step(canary) == Step::Activating && r.step(other) == Step::Staged);
+    let (mut rig, canary, other) = canary_activating();
     for n in [canary, other] {
         rig.shows_another_key(n);
     }
     rig.until(300, |r| r.phase() == Phase::Completed);
     for n in [canary, other] {
-        let why = rig.of("ro", n).why.expect("a reason");
+        let why = rig.robot_in("ro", n).why.expect("a reason");
         assert_eq!((why.code, why.metadata["device_key"].as_str()), (Code::SkippedOtherKey, &*"ab".repeat(32)));
         assert_eq!(rig.robots[n].version, "0.9.0");
     }
@@ -154,7 +156,7 @@ fn another_device_key_that_a_person_took_keeps_a_robot_from_nothing() {
 fn an_excluded_robot_is_left_out_and_somebody_stands_in() {
     let mut rig = Rig::new(4);
     rig.fleet_sleeps = true;
-    rig.start(RolloutSpec { small_wave: super::super::spec::SmallWave::Review, ..spec() });
+    rig.start(RolloutSpec { small_wave: crate::rollout::projection::spec::SmallWave::Review, ..spec() });
     let n = rig.order()[0];
     rig.must("ro", Verb::Pause);
     rig.ticks(2);
@@ -163,16 +165,13 @@ fn an_excluded_robot_is_left_out_and_somebody_stands_in() {
     rig.fleet_sleeps = false;
     rig.must("ro", Verb::Resume);
     rig.until(60, |r| r.phase() == Phase::Review);
-    assert_eq!(rig.of("ro", n).why.expect("a reason").code, Code::SkippedExcluded);
+    assert_eq!(rig.robot_in("ro", n).why.expect("a reason").code, Code::SkippedExcluded);
     assert_eq!((rig.rollout("ro").wave, rig.count(Step::Trial)), (0, 1));
 }
 
 #[test]
 fn a_quarantined_robot_gets_it_again_only_after_a_person_has_looked() {
-    let mut rig = Rig::new(4);
-    rig.start(spec());
-    let n = rig.order()[0];
-    rig.until(60, |r| r.step(n) == Step::Trial);
+    let (mut rig, n) = canary_on_trial();
     rig.goes_back(n, Some(Code::BreakerOnTrial));
     rig.until(60, |r| r.phase() == Phase::Aborted);
     done_as(&mut rig, "next");
@@ -195,12 +194,12 @@ fn a_retired_robot_gives_its_drain_back_and_is_waited_for_by_nobody() {
     rig.start(spec());
     let n = rig.order()[0];
     rig.robots[n].fate = Fate::Dawdles;
-    rig.until(20, |r| r.of("ro", n).grant.is_some());
+    rig.until(20, |r| r.robot_in("ro", n).grant.is_some());
     rig.robots[n].is_off = true;
     rig.retire(n);
     rig.ticks(2);
     assert_eq!(rig.releases(), [ReleasedBy::Retired]);
-    assert_eq!(rig.of("ro", n).why.expect("a reason").code, Code::SkippedRetired);
+    assert_eq!(rig.robot_in("ro", n).why.expect("a reason").code, Code::SkippedRetired);
     rig.until(300, |r| r.phase() == Phase::Completed);
 }
 

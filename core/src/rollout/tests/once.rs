@@ -24,7 +24,7 @@ impl Rig {
         self.ota_turn();
         let mut taken = Ok(Taken::Now);
         let ask = asked(command, CheckOnly::No, Some(request_id));
-        self.ota_plan(|rig, plan| taken = commands::take(&mut rig.ota, &rig.board, rig.now, &ask, plan));
+        self.ota_plan(|rig, plan| taken = decide_request(&mut rig.ota, &rig.board, rig.now, &ask, plan));
         taken
     }
 
@@ -77,14 +77,14 @@ fn what_is_only_checked_writes_nothing_and_finds_what_would_be_refused() {
         let mut plan = Plan::default();
         for id in [None, Some("a")] {
             let ask = asked(&command, CheckOnly::Yes, id);
-            let taken = commands::take(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan);
+            let taken = decide_request(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan);
             assert_eq!(taken.expect("nothing is against it"), Taken::Now);
         }
         assert_eq!(plan.items, Vec::<Item>::new(), "{command:?}");
     }
     let nobody = Command::LiftQuarantine { robot_id: robot_id(1), bundle: bundle_id(9) };
     let ask = asked(&nobody, CheckOnly::Yes, None);
-    let refused = commands::take(&mut rig.ota, &rig.board, rig.now, &ask, &mut Plan::default());
+    let refused = decide_request(&mut rig.ota, &rig.board, rig.now, &ask, &mut Plan::default());
     assert_eq!(refused.expect_err("there is none").reason.code, Code::QuarantineNotFound);
 }
 
@@ -99,7 +99,7 @@ fn each_command_is_carried_out_once_for_its_request_id_and_another_one_is_refuse
         let mut plan = Plan::default();
         for check_only in [CheckOnly::No, CheckOnly::Yes] {
             let ask = asked(&command, check_only, Some(&id));
-            let taken = commands::take(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan).expect("it was done");
+            let taken = decide_request(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan).expect("it was done");
             assert_eq!(taken, Taken::Before(Utc(key.at_unix_ms)), "{command:?} {check_only:?}");
         }
         assert_eq!(plan.items, Vec::<Item>::new(), "{command:?}");
@@ -136,7 +136,7 @@ fn what_a_request_does_and_its_id_are_one_item() {
     rig.ota_turn();
     let mut plan = Plan::default();
     let ask = asked(&pin(1), CheckOnly::No, Some("a"));
-    commands::take(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan).expect("allowed");
+    decide_request(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan).expect("allowed");
     let [item] = &plan.items[..] else { panic!("{} items", plan.items.len()) };
     assert_eq!((item.rows.len(), item.request_id.as_deref()), (2, Some("a")));
 }

@@ -52,7 +52,7 @@ fn a_stale_etag_is_refused_and_the_newest_is_not() {
     rig.until(60, |r| r.phase() == Phase::Soaking);
     let revision = Revision(rig.ota.rollouts["ro"].row.version);
     let abort = Command::Do { rollout_id: rollout_id("ro"), verb: Verb::Abort, reason: String::new() };
-    let ask = |rig: &Rig, seen| commands::check(&rig.ota, &rig.board, &abort, Some(seen));
+    let ask = |rig: &Rig, seen| check_command(&rig.ota, &rig.board, &abort, Some(seen));
     assert!(ask(&rig, Revision(revision.0 - 1)).is_err());
     assert!(ask(&rig, revision).is_ok());
 }
@@ -62,7 +62,7 @@ fn a_bundle_that_is_taken_back_pauses_its_roll_outs_and_one_that_is_listed_again
     let mut rig = Rig::new(4);
     rig.start(spec());
     rig.until(60, |r| r.phase() == Phase::Soaking);
-    let revoked = BTreeSet::from([super::super::rows::Pause::Revoked]);
+    let revoked = BTreeSet::from([crate::rollout::projection::rows::Pause::Revoked]);
     rig.put(Bundle { listed: false, ..bundle(2) });
     rig.ticks(2);
     assert_eq!(rig.rollout("ro").pauses, revoked);

@@ -36,7 +36,7 @@ impl Rig {
         let (check_only, by) = (CheckOnly::No, by.clone());
         let ask = Ask { command: command.clone(), seen: None, check_only, request_id: None, by };
         self.ota_plan(|rig, plan| {
-            taken = commands::take(&mut rig.ota, &rig.board, rig.now, &ask, plan).map(drop);
+            taken = decide_request(&mut rig.ota, &rig.board, rig.now, &ask, plan).map(drop);
         });
         taken.map_err(|refusal| (refusal.kind(), refusal.reason.code))
     }
@@ -54,7 +54,7 @@ fn whoever_may_not_leaves_that_in_the_audit_and_who_only_checks_or_sees_nothing_
         let request_id = Some("q1".to_owned());
         let ask = Ask { command, seen: None, check_only, request_id, by };
         let mut plan = Plan::default();
-        let taken = commands::take(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan);
+        let taken = decide_request(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan);
         assert!(taken.is_err());
         let told = plan.items.iter().map(|item| {
             assert!(item.rows.is_empty(), "it says that alone");
@@ -141,7 +141,7 @@ fn a_roll_out_is_for_whoever_may_in_all_areas_that_it_is_for() {
     for (id, hers, his) in [("hall", Ok(()), Ok(())), ("quality", DENIED, MISSING), ("site", MISSING, MISSING)] {
         assert_eq!(rig.by(&anna, &verb(id, Verb::Submit)), hers, "{id}");
         assert_eq!(rig.by(&blind, &verb(id, Verb::Submit)), his, "{id}");
-        let is_seen = |by: &Caller, rig: &Rig| objects::seen(&rig.ota, by, &rollout_id(id)).is_ok();
+        let is_seen = |by: &Caller, rig: &Rig| objects::find_seen(&rig.ota, by, &rollout_id(id)).is_ok();
         assert_eq!((is_seen(&anna, &rig), is_seen(&blind, &rig)), (hers != MISSING, his != MISSING), "{id}");
         let rollback = Command::Rollback { of: rollout_id(id), rollout_id: rollout_id("back") };
         let refused = rig.by(&blind, &rollback);

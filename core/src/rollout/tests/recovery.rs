@@ -8,10 +8,10 @@ fn what_meant_nothing_when_it_was_said_means_nothing_after_a_restart() {
     rig.start(spec());
     let n = rig.order()[0];
     rig.robots[n].fate = Fate::Dawdles;
-    rig.until(20, |r| r.of("ro", n).grant.is_some());
+    rig.until(20, |r| r.robot_in("ro", n).grant.is_some());
     // The old software has a fault that the new one must not have.
     let fault = Fault { code: 66, class: crate::robot::FaultClass::Recoverable, message: String::new() };
-    rig.say(n, RobotEvent::Fault { fault, cleared: false });
+    rig.say_event(n, RobotEvent::Fault { fault, cleared: false });
     // Within the same second a heartbeat says that the new one runs.
     let report = rig.robots[n].report.clone().expect("an update");
     rig.robots[n].report = Some(UpdateReport { state: UpdateState::Trial, ..report });
@@ -21,16 +21,13 @@ fn what_meant_nothing_when_it_was_said_means_nothing_after_a_restart() {
     assert_eq!(rig.step(n), Step::Trial);
     rig.restart();
     rig.ota_turn();
-    assert_eq!(rig.of("ro", n).failure, None);
+    assert_eq!(rig.robot_in("ro", n).failure, None);
     assert_eq!(rig.rollout("ro").abort, None);
 }
 
 #[test]
 fn a_heartbeat_that_is_older_than_what_the_robot_said_since_changes_nothing() {
-    let mut rig = Rig::new(4);
-    rig.start(spec());
-    let n = rig.order()[0];
-    rig.until(60, |r| r.step(n) == Step::Trial);
+    let (mut rig, n) = canary_on_trial();
     rig.beat(n);
     rig.report(n, UpdateState::RolledBack);
     rig.ota_turn();
@@ -66,7 +63,7 @@ fn a_start_that_was_cut_short_reaches_all_robots_all_the_same() {
     let command =
         Command::Do { rollout_id: rollout_id("ro"), verb: Verb::Start { supersede: false }, reason: String::new() };
     let mut plan = Plan::default();
-    commands::apply(&mut rig.ota, &rig.board, rig.now, &command, &"ana".into(), &mut plan);
+    carry_out(&mut rig.ota, &rig.board, rig.now, &command, &"ana".into(), &mut plan);
     assert_eq!(plan.items.len(), 2, "the second was never written");
     plan.items.truncate(1);
     rig.commit(plan.items);

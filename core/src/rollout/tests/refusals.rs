@@ -1,23 +1,24 @@
 //! What robots refuse: each refusal keeps its meaning, and content that is not what was signed holds a roll-out.
 
-use super::super::refusals;
-use super::super::robots::{self, Move};
-use super::super::rows::Pause;
 use super::*;
+use crate::rollout::judgement::refusals;
+use crate::rollout::projection::rows::Pause;
+use crate::rollout::robots::due;
+use crate::rollout::robots::machine::Move;
 
 fn is_held(rig: &Rig) -> bool {
     rig.rollout("ro").pauses.contains(&Pause::Content)
 }
 
 fn why(rig: &Rig, n: usize) -> Code {
-    rig.of("ro", n).why.expect("a reason").code
+    rig.robot_in("ro", n).why.expect("a reason").code
 }
 
 /// A robot that has the bundle finds that its bytes changed on its disk.
 fn finds_other_bytes(rig: &mut Rig, n: usize) {
     let report = rig.robots[n].report.clone().expect("an update");
     let reason = Some(Code::BundleCorrupt.into());
-    rig.tell(n, UpdateReport { state: UpdateState::Refused, reason, ..report });
+    rig.report_update(n, UpdateReport { state: UpdateState::Refused, reason, ..report });
 }
 
 #[test]
@@ -76,9 +77,9 @@ fn a_person_has_seen_robots_and_not_so_many_of_them() {
     rig.until(60, |r| r.phase() == Phase::Soaking);
     assert_eq!(why(&rig, order[3]), Code::BundleCorrupt);
     let seen = |n: usize| Rollout { refusals_seen: BTreeSet::from([robot_id(n)]), ..rig.rollout("ro") };
-    assert_eq!(refusals::pause(&rig.ota, &seen(order[3])), None);
+    assert_eq!(refusals::find_pause(&rig.ota, &seen(order[3])), None);
     // That one is tried once more, and refuses nothing at this moment.
-    assert_eq!(refusals::pause(&rig.ota, &seen(order[4])), Some(Pause::Content), "nobody has seen the other");
+    assert_eq!(refusals::find_pause(&rig.ota, &seen(order[4])), Some(Pause::Content), "nobody has seen the other");
 }
 
 #[test]
@@ -88,8 +89,8 @@ fn nobody_is_tried_again_while_the_roll_out_stands_still() {
     rig.until(5, |r| r.phase() == Phase::Applying);
     let rollout = Rollout { second_pass: true, ..rig.rollout("ro") };
     let refused = Some(Code::MetadataRefused.into());
-    let r = RolloutRobot { step: Step::Skipped, why: refused, ..rig.of("ro", rig.order()[1]) };
-    let due = |rollout: &Rollout| robots::next(&rig.ota, &rig.board, &rig.now, rollout, &r);
+    let r = RolloutRobot { step: Step::Skipped, why: refused, ..rig.robot_in("ro", rig.order()[1]) };
+    let due = |rollout: &Rollout| due::find_move(&rig.ota, &rig.board, &rig.now, rollout, &r);
     assert_eq!(due(&rollout), Some(Move::Again));
     let held = Rollout { pauses: BTreeSet::from([Pause::Content]), ..rollout };
     assert_eq!(due(&held), None, "its refusal would be forgotten, and the roll-out go on");

@@ -16,13 +16,13 @@ fn who_was_skipped_is_tried_once_more_at_the_end_and_then_it_is_final() {
     rig.robots[1].is_off = false;
     rig.until(300, |r| r.phase() == Phase::Completed);
     rig.ticks(5);
-    assert_eq!(rig.of("ro", 1).step, Step::Committed);
-    assert!(rig.of("ro", 1).again);
-    let r = rig.of("ro", 2);
+    assert_eq!(rig.robot_in("ro", 1).step, Step::Committed);
+    assert!(rig.robot_in("ro", 1).again);
+    let r = rig.robot_in("ro", 2);
     assert_eq!((r.step, r.why.expect("a reason").code, r.again), (Step::Skipped, Code::SkippedOffline, true));
     rig.robots[2].is_off = false;
     rig.ticks(20);
-    assert_eq!(rig.of("ro", 2).step, Step::Skipped, "it is final");
+    assert_eq!(rig.robot_in("ro", 2).step, Step::Skipped, "it is final");
 }
 
 #[test]
@@ -63,7 +63,7 @@ fn a_completed_roll_out_is_taken_back_by_another() {
     assert!(rig.ota.area_bundles.values().all(|a| a.row.rollouts.is_empty()), "newcomers do not get it");
     assert!(rig.ota.quarantines.is_empty());
     rig.robots[3].is_off = false;
-    rig.until(60, |r| r.of("back", 3).step == Step::RolledBack);
+    rig.until(60, |r| r.robot_in("back", 3).step == Step::RolledBack);
     assert_eq!(rig.robots[3].version, "0.9.0");
     let software: RobotSoftware = rig.row(robot_id(0).as_str()).expect("a row");
     assert_eq!((software.committed, software.on_trial), (None, None));
@@ -95,7 +95,7 @@ fn failed_and_skipped_robots_are_retried_one_by_one_and_their_quarantine_is_lift
     assert_eq!(rig.step(n), Step::RolledBack);
     assert_eq!(rig.ota.quarantines.len(), 1);
     rig.must("ro", Verb::RetryFailed);
-    assert_eq!(rig.of("ro", n).why.map(|w| (w.code, w.message)), Some((Code::RetriedByUser, "because".into())));
+    assert_eq!(rig.robot_in("ro", n).why.map(|w| (w.code, w.message)), Some((Code::RetriedByUser, "because".into())));
     assert!(rig.ota.quarantines.is_empty());
     rig.until(100, |r| r.step(n) == Step::Committed);
     assert_eq!(rig.robots[n].version, "2.0.0");

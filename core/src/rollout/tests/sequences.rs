@@ -1,4 +1,5 @@
-//! Any order of reports, heartbeats, commands and time: the laws of [`Rig::assert_laws`] hold, items find their rows, nothing panics.
+//! Any order of reports, heartbeats, commands and time: the laws of [`Rig::assert_laws`] hold, items find their rows,
+//! nothing panics.
 
 use super::*;
 use proptest::prelude::*;
@@ -68,7 +69,7 @@ fn verb(number: u8) -> Verb {
     }
 }
 
-fn carry_out(rig: &mut Rig, deed: &Deed) {
+fn play(rig: &mut Rig, deed: &Deed) {
     match deed {
         Deed::Tick => rig.tick(),
         Deed::Wait(ms) => {
@@ -87,17 +88,20 @@ fn carry_out(rig: &mut Rig, deed: &Deed) {
             let set = crate::ids::SetId::parse("factory").expect("an id");
             let drain_id = rig.ota.robots.values().find_map(|r| r.row.drain_id.clone());
             if let Some(drain_id) = drain_id {
-                rig.say(*n, RobotEvent::Update(UpdateEvent::Ready { drain_id, set }));
+                rig.say_event(*n, RobotEvent::Update(UpdateEvent::Ready { drain_id, set }));
             }
         }
         Deed::Fault(n) => {
             let class = crate::robot::FaultClass::Recoverable;
-            rig.say(*n, RobotEvent::Fault { fault: Fault { code: 66, class, message: String::new() }, cleared: false });
+            rig.say_event(
+                *n,
+                RobotEvent::Fault { fault: Fault { code: 66, class, message: String::new() }, cleared: false },
+            );
         }
         Deed::Stop(n, stopped) => {
             let stop = if *stopped { HardwareStop::Manual } else { HardwareStop::None };
             rig.robots[*n].stop = stop;
-            rig.say(*n, RobotEvent::HardwareStop(stop));
+            rig.say_event(*n, RobotEvent::HardwareStop(stop));
         }
         Deed::Retire(n) => rig.retire(*n),
         Deed::Pin(n) => drop(rig.ask(&Command::Pin { robot_id: robot_id(*n), reason: String::new() })),
@@ -116,7 +120,7 @@ proptest! {
         rig.start(RolloutSpec { waves: vec![Wave::Count(1), Wave::Count(2), Wave::Rest], allow_full_push: true, ..spec() });
         let mut abort = None;
         for deed in &deeds {
-            carry_out(&mut rig, deed);
+            play(&mut rig, deed);
             rig.ota_turn();
             let rollout = rig.rollout("ro");
             prop_assert!(abort.is_none() || rollout.abort == abort, "an abort was taken back");
@@ -124,7 +128,7 @@ proptest! {
             for r in rig.ota.robots_of(&rollout.rollout_id) {
                 let none_left = r.step.is_over() && r.drain_id.is_some();
                 prop_assert!(!none_left, "{} is over and holds a drain", r.robot_id);
-                let blocked = super::super::explain::blocked(&rig.ota, &rig.board, &rig.now, &rollout, r);
+                let blocked = crate::rollout::explain::blocked(&rig.ota, &rig.board, &rig.now, &rollout, r);
                 prop_assert_eq!(blocked.is_none(), r.step.is_over());
             }
         }

@@ -18,13 +18,14 @@ fn a_canary_that_is_not_heard_is_replaced_by_the_next_robot() {
     rig.create("ro", spec());
     rig.must("ro", Verb::Submit);
     rig.must("ro", Verb::Approve);
-    let canary = super::super::matching::members(&rig.ota, &rig.board, &rig.rollout("ro")).0[0].0.clone();
+    let canary =
+        crate::rollout::members::matching::find_members(&rig.ota, &rig.board, &rig.rollout("ro")).0[0].0.clone();
     let n: usize = canary.as_str()[1..].parse().expect("a number");
     rig.robots[n].is_off = true;
     rig.ticks(40);
     rig.must("ro", Verb::Start { supersede: false });
     rig.until(60, |r| r.phase() == Phase::Soaking);
-    assert_eq!(rig.of("ro", n).why.expect("a reason").code, Code::SkippedOffline);
+    assert_eq!(rig.robot_in("ro", n).why.expect("a reason").code, Code::SkippedOffline);
     let first = |r: &&RolloutRobot| r.wave == 0 && r.step == Step::Trial;
     assert_eq!(rig.ota.robots_of(&rollout_id("ro")).filter(first).count(), 1);
 }
@@ -38,8 +39,8 @@ fn a_robot_that_was_told_and_falls_silent_before_its_drain_is_skipped_and_not_dr
     assert_eq!(rig.step(n), Step::Staged);
     rig.robots[n].is_off = true;
     rig.until(200, |r| r.rollout("ro").wave == 1 && r.phase() == Phase::Soaking);
-    assert_eq!(rig.of("ro", n).why.expect("a reason").code, Code::SkippedOffline);
-    assert!(rig.of("ro", n).moments.asked.is_none());
+    assert_eq!(rig.robot_in("ro", n).why.expect("a reason").code, Code::SkippedOffline);
+    assert!(rig.robot_in("ro", n).moments.asked.is_none());
 }
 
 #[test]
@@ -67,7 +68,7 @@ fn a_robot_that_gets_no_bytes_is_passed_over_after_its_time_and_pauses_do_not_co
     assert_eq!(rig.step(n), Step::Staging, "it stood still for all but that");
     wait(&mut rig, 60_000);
     rig.tick();
-    assert_eq!(rig.of("ro", n).why.expect("a reason").code, Code::SkippedStuck);
+    assert_eq!(rig.robot_in("ro", n).why.expect("a reason").code, Code::SkippedStuck);
 }
 
 #[test]
@@ -79,7 +80,7 @@ fn a_robot_that_refuses_the_bundle_is_left_out_and_not_tried_again() {
         rig.must("ro", verb);
     }
     rig.until(400, |r| r.phase() == Phase::Completed);
-    let r = rig.of("ro", 2);
+    let r = rig.robot_in("ro", 2);
     assert_eq!((r.step, r.why.expect("a reason").code, r.again), (Step::Skipped, Code::BundleUnfit, false));
     assert!(!rig.rollout("ro").second_pass);
 }
@@ -93,7 +94,7 @@ fn refused_for(code: Code) -> Rig {
         rig.must("ro", verb);
     }
     rig.until(400, |r| r.phase() == Phase::Completed);
-    let r = rig.of("ro", 2);
+    let r = rig.robot_in("ro", 2);
     assert_eq!((r.step, r.why.map(|why| why.code), r.attempted), (Step::Skipped, Some(code), false));
     rig
 }
@@ -102,11 +103,11 @@ fn refused_for(code: Code) -> Rig {
 fn a_refusal_keeps_its_own_reason_and_one_that_may_pass_is_asked_once_more_at_the_end() {
     for code in [Code::NoRoom, Code::BaseTooSoon, Code::MetadataRefused] {
         let rig = refused_for(code);
-        assert_eq!((rig.rollout("ro").second_pass, rig.of("ro", 2).again), (true, true), "{code:?}");
+        assert_eq!((rig.rollout("ro").second_pass, rig.robot_in("ro", 2).again), (true, true), "{code:?}");
     }
     for code in [Code::BundleUnfit, Code::BundleCorrupt] {
         let rig = refused_for(code);
-        assert_eq!((rig.rollout("ro").second_pass, rig.of("ro", 2).again), (false, false), "{code:?}");
+        assert_eq!((rig.rollout("ro").second_pass, rig.robot_in("ro", 2).again), (false, false), "{code:?}");
     }
 }
 
@@ -121,13 +122,13 @@ fn a_robot_whose_base_came_too_soon_is_asked_again_after_its_wait_and_in_no_wave
     rig.tick();
     let reason = Some(Reason::from(Code::BaseTooSoon).with("wait_ms", WAIT_MS));
     let told = rig.robots[n].report.clone().expect("an update");
-    rig.tell(n, UpdateReport { state: UpdateState::Refused, reason, ..told });
+    rig.report_update(n, UpdateReport { state: UpdateState::Refused, reason, ..told });
     rig.robots[n].fate = Fate::Good;
     rig.until(10, |r| r.step(n) == Step::Skipped);
     let skipped = rig.now.utc;
     rig.until(400, |r| r.step(n) != Step::Skipped);
     assert!(rig.now.utc.ms_since(skipped) >= WAIT_MS, "not before");
-    let (r, rollout) = (rig.of("ro", n), rig.rollout("ro"));
+    let (r, rollout) = (rig.robot_in("ro", n), rig.rollout("ro"));
     assert_eq!((r.again, r.wave, rollout.phase, rollout.second_pass), (true, rollout.wave, Phase::Applying, false));
     assert!((1..=3).contains(&r.wave), "wave {}", r.wave);
     rig.until(400, |r| r.phase() == Phase::Completed);
@@ -138,7 +139,7 @@ fn a_robot_whose_base_came_too_soon_is_asked_again_after_its_wait_and_in_no_wave
 fn a_robot_that_has_the_bundle_already_is_left_alone_and_known_to_have_it() {
     let rig = refused_for(Code::SkippedCurrent);
     assert!(!rig.rollout("ro").second_pass);
-    assert_eq!(rig.of("ro", 2).moments.asked, None, "it was not taken out of work");
+    assert_eq!(rig.robot_in("ro", 2).moments.asked, None, "it was not taken out of work");
     assert_eq!(rig.ota.software_of(&robot_id(2)).committed, Some(bundle_id(2)));
 }
 
@@ -149,7 +150,7 @@ fn robots_that_another_roll_out_keeps_for_ever_are_passed_over() {
     rig.until(400, |r| r.phase() == Phase::Completed);
     // One never says that it has committed.
     let n = rig.order()[2];
-    let mut kept = rig.of("ro", n);
+    let mut kept = rig.robot_in("ro", n);
     kept.step = Step::Committing;
     rig.put(kept);
     rig.report(n, UpdateState::Trial);
@@ -166,5 +167,5 @@ fn robots_that_another_roll_out_keeps_for_ever_are_passed_over() {
     rig.pass(crate::limits::STAGED_WITHIN.as_ms());
     rig.turn();
     rig.until(200, |r| r.rollout("next").phase == Phase::Completed);
-    assert_eq!(rig.of("next", n).why.expect("a reason").code, Code::SkippedBusy);
+    assert_eq!(rig.robot_in("next", n).why.expect("a reason").code, Code::SkippedBusy);
 }

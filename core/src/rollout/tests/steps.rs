@@ -1,12 +1,12 @@
 //! Every step of a robot beside every state that it may report: what follows, and that each has a way to an end.
 
-use super::super::robots::{self, Move};
 use super::*;
+use crate::rollout::robots::{due, machine};
 
 /// A rig with roll-out `ro` applying wave 0 and robot 0 made to stand at `step` in it.
 fn at(rig: &mut Rig, step: Step) -> RolloutRobot {
     let n = rig.order()[0];
-    let mut r = rig.of("ro", n);
+    let mut r = rig.robot_in("ro", n);
     r.step = step;
     r.since = rig.now.utc;
     r.attempted = step.is_active() || matches!(step, Step::Committed | Step::RolledBack);
@@ -32,42 +32,30 @@ fn reported(rig: &Rig, r: &RolloutRobot, state: Option<UpdateState>) -> Board {
     board
 }
 
-const STEPS: [Step; 12] = [
-    Step::Waiting,
-    Step::Staging,
-    Step::Staged,
-    Step::Draining,
-    Step::Activating,
-    Step::Trial,
-    Step::Committing,
-    Step::Reverting,
-    Step::Committed,
-    Step::RolledBack,
-    Step::Skipped,
-    Step::Stuck,
-];
-
-/// What follows in short.
-fn name(due: Option<&Move>) -> String {
-    due.map_or("-".into(), |due| format!("{due:?}").split(['(', ' ', '{']).next().unwrap_or_default().to_owned())
+/// What is due in short; each such move stands in the table.
+fn name_of_move(rig: &Rig, board: &Board, rollout: &Rollout, r: &RolloutRobot) -> String {
+    let Some(due) = due::find_move(&rig.ota, board, &rig.now, rollout, r) else { return "-".to_owned() };
+    assert!(machine::next(r.step, &due).is_some(), "{due:?} at {:?}", r.step);
+    format!("{due:?}").split(['(', ' ', '{']).next().unwrap_or_default().to_owned()
 }
 
 #[test]
 fn every_step_and_every_report_has_the_move_that_the_table_says() {
     let (mut rig, rollout) = applying();
     let mut table = String::new();
-    for step in STEPS {
+    for step in Step::ALL {
         let r = at(&mut rig, step);
         let states = UpdateState::ALL.into_iter().map(Some).chain([None]);
         let moves: Vec<String> = states
             .map(|state| {
                 let board = reported(&rig, &r, state);
-                name(robots::next(&rig.ota, &board, &rig.now, &rollout, &r).as_ref())
+                name_of_move(&rig, &board, &rollout, &r)
             })
             .collect();
         table += &format!("{step:?}: {}\n", moves.join(" "));
     }
-    // Directed Downloading Staged Switching Probation Trial Committing RollingBack Committed RolledBack Refused Stuck none
+    // Directed Downloading Staged Switching Probation Trial Committing RollingBack Committed RolledBack Refused Stuck
+    // none
     let expected = "\
 Waiting: Stage Stage Stage Stage Stage Stage Stage Stage Stage Stage Stage Stage Stage
 Staging: - - IsStaged IsStaged IsStaged IsStaged IsStaged IsStaged IsStaged IsStaged Skip IsStaged IsStaged
@@ -91,7 +79,7 @@ fn a_robot_that_refuses_after_it_was_given_permission_is_over_and_its_drain_is_r
     rig.start(spec());
     let n = rig.order()[0];
     rig.robots[n].fate = Fate::Dawdles;
-    rig.until(20, |r| r.of("ro", n).grant.is_some());
+    rig.until(20, |r| r.robot_in("ro", n).grant.is_some());
     rig.report(n, UpdateState::Refused);
     rig.tick();
     assert_eq!(rig.step(n), Step::Skipped);
@@ -104,11 +92,11 @@ fn whoever_is_retired_is_waited_for_at_no_step() {
     let n = rig.order()[0];
     rig.retire(n);
     rig.ota_turn();
-    for step in STEPS {
+    for step in Step::ALL {
         let r = at(&mut rig, step);
         for state in UpdateState::ALL.into_iter().map(Some).chain([None]) {
-            let due = robots::next(&rig.ota, &reported(&rig, &r, state), &rig.now, &rollout, &r);
-            assert_eq!(name(due.as_ref()) == "Skip", !step.is_over(), "{step:?} {state:?}");
+            let due = name_of_move(&rig, &reported(&rig, &r, state), &rollout, &r);
+            assert_eq!(due == "Skip", !step.is_over(), "{step:?} {state:?}");
         }
     }
 }
@@ -118,11 +106,11 @@ fn after_an_abort_no_step_but_a_stuck_one_keeps_the_bundle_whatever_is_reported(
     let (mut rig, _) = applying();
     rig.must("ro", Verb::Abort);
     let rollout = rig.rollout("ro");
-    for step in STEPS {
+    for step in Step::ALL {
         let mut r = at(&mut rig, step);
         r.drain_id = None;
         for state in UpdateState::ALL.into_iter().map(Some).chain([None]) {
-            let due = name(robots::next(&rig.ota, &reported(&rig, &r, state), &rig.now, &rollout, &r).as_ref());
+            let due = name_of_move(&rig, &reported(&rig, &r, state), &rollout, &r);
             let ok = match step {
                 Step::Waiting | Step::Staging | Step::Staged => due == "Skip",
                 Step::Draining => due == "-",
@@ -145,8 +133,8 @@ fn after_an_abort_no_step_but_a_stuck_one_keeps_the_bundle_whatever_is_reported(
 fn whoever_waits_for_a_wave_is_told_which_robots_of_it_are_not_decided() {
     let (rig, rollout) = applying();
     let order = rig.order();
-    let r = rig.of("ro", order[2]);
-    let by = super::super::explain::blocked(&rig.ota, &rig.board, &rig.now, &rollout, &r).expect("it waits").by;
+    let r = rig.robot_in("ro", order[2]);
+    let by = crate::rollout::explain::blocked(&rig.ota, &rig.board, &rig.now, &rollout, &r).expect("it waits").by;
     let named = by.metadata.get("robot_ids").map(String::as_str);
     assert_eq!((by.code, named), (Code::BlockedByWave, Some(robot_id(order[0]).as_str())));
 }
@@ -154,10 +142,10 @@ fn whoever_waits_for_a_wave_is_told_which_robots_of_it_are_not_decided() {
 #[test]
 fn each_waiting_robot_has_one_reason_and_who_is_done_has_none() {
     let (mut rig, rollout) = applying();
-    for step in STEPS {
+    for step in Step::ALL {
         let r = at(&mut rig, step);
         let board = reported(&rig, &r, None);
-        let blocked = super::super::explain::blocked(&rig.ota, &board, &rig.now, &rollout, &r);
+        let blocked = crate::rollout::explain::blocked(&rig.ota, &board, &rig.now, &rollout, &r);
         assert_eq!(blocked.is_none(), step.is_over(), "{step:?}");
         if let Some(blocked) = blocked {
             assert!(!blocked.by.code.next_step().is_empty(), "{step:?}: what a person can do");

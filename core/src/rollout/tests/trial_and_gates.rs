@@ -1,8 +1,8 @@
 //! What is counted for and against a bundle, and what the gate behind each wave says with which numbers.
 
-use super::super::rows::Verdict;
 use super::*;
 use crate::gates::EffortLimits;
+use crate::rollout::projection::rows::Verdict;
 
 fn verdicts(rig: &Rig) -> Vec<(Outcome, Code, u32)> {
     let all = rig.rollout("ro").verdicts;
@@ -28,7 +28,7 @@ fn a_good_bundle_comes_to_all_and_each_verdict_says_what_was_not_proven() {
 #[test]
 fn a_wave_that_proves_nothing_is_asked_about_if_the_spec_says_so() {
     let mut rig = Rig::new(4);
-    rig.start(RolloutSpec { small_wave: super::super::spec::SmallWave::Review, ..spec() });
+    rig.start(RolloutSpec { small_wave: crate::rollout::projection::spec::SmallWave::Review, ..spec() });
     rig.until(100, |r| r.phase() == Phase::Review);
     assert_eq!(verdicts(&rig), [(Outcome::Review, Code::GateAsksPerson, 1)]);
     rig.must("ro", Verb::Promote);
@@ -89,7 +89,7 @@ fn a_robot_that_is_kept_out_of_work_is_not_waited_for_and_proves_nothing() {
     rig.robots[n].idles = true;
     rig.until(200, |r| r.phase() == Phase::Completed);
     rig.ticks(4);
-    assert_eq!(rig.of("ro", n).step, Step::Committed, "it has the bundle as all others");
+    assert_eq!(rig.robot_in("ro", n).step, Step::Committed, "it has the bundle as all others");
     let last = rig.rollout("ro").verdicts.pop().expect("a verdict");
     assert_eq!((last.attempted, last.robots.outcomes.clean), (5, 4));
 }
@@ -125,9 +125,9 @@ fn one_failure_among_few_aborts_and_says_how_often_that_happens_to_good_bundles(
 fn a_wave_of_which_all_failed_is_reviewed_and_never_followed_by_the_next() {
     let mut rig = Rig::new(6);
     rig.fates(Fate::Probation);
-    rig.start(RolloutSpec { small_wave_failure: super::super::spec::SmallWaveFailure::Review, ..spec() });
+    rig.start(RolloutSpec { small_wave_failure: crate::rollout::projection::spec::SmallWaveFailure::Review, ..spec() });
     let n = rig.order()[0];
-    rig.until(60, |r| r.of("ro", n).moments.switched.is_some());
+    rig.until(60, |r| r.robot_in("ro", n).moments.switched.is_some());
     rig.goes_back(n, Some(Code::BreakerOnTrial));
     rig.until(5, |r| r.phase() == Phase::Review);
     assert_eq!(verdicts(&rig), [(Outcome::Review, Code::GateInconclusive, 1)]);
@@ -160,7 +160,7 @@ fn a_robot_that_stays_on_probation_keeps_no_wave_waiting_for_ever() {
     rig.pass(crate::limits::STAGED_WITHIN.as_ms());
     rig.turn();
     rig.until(60, |r| r.phase() == Phase::Completed);
-    assert!(rig.of("ro", n).drain_id.is_some(), "it is not given work");
+    assert!(rig.robot_in("ro", n).drain_id.is_some(), "it is not given work");
     assert_eq!(rig.rollout("ro").verdicts.last().expect("one").robots.outcomes.clean, 4);
 }
 
@@ -187,14 +187,11 @@ fn fault(code: u32) -> RobotEvent {
 
 #[test]
 fn a_code_of_the_manifest_ends_it_at_once_and_others_do_not() {
-    let mut rig = Rig::new(4);
-    rig.start(spec());
-    let n = rig.order()[0];
-    rig.until(60, |r| r.step(n) == Step::Trial);
-    rig.say(n, fault(7));
+    let (mut rig, n) = canary_on_trial();
+    rig.say_event(n, fault(7));
     rig.tick();
     assert!(rig.rollout("ro").abort.is_none());
-    rig.say(n, fault(66));
+    rig.say_event(n, fault(66));
     rig.ota_turn();
     let abort = rig.rollout("ro").abort.expect("it ends");
     assert_eq!((abort.reason.code, abort.hard, abort.robots), (Code::HardStopCode, true, vec![robot_id(n)]));
@@ -202,12 +199,9 @@ fn a_code_of_the_manifest_ends_it_at_once_and_others_do_not() {
 
 #[test]
 fn hard_stops_act_also_while_the_roll_out_stands_still() {
-    let mut rig = Rig::new(4);
-    rig.start(spec());
-    let n = rig.order()[0];
-    rig.until(60, |r| r.step(n) == Step::Trial);
+    let (mut rig, n) = canary_on_trial();
     rig.must("ro", Verb::Pause);
-    rig.say(n, fault(66));
+    rig.say_event(n, fault(66));
     rig.ota_turn();
     assert!(rig.phase().goes_back());
 }
@@ -220,13 +214,13 @@ fn a_stop_counts_within_ten_minutes_of_the_switch_also_in_the_breath_in_which_th
         rig.start(RolloutSpec { soak_ms: 3_000_000, ..spec() });
         let n = rig.order()[0];
         rig.robots[n].fate = Fate::Probation;
-        rig.until(60, |r| r.of("ro", n).moments.switched.is_some());
+        rig.until(60, |r| r.robot_in("ro", n).moments.switched.is_some());
         rig.report(n, UpdateState::Trial);
         if later_ms > 0 {
             rig.ota_turn();
             rig.pass(later_ms);
         }
-        rig.say(n, RobotEvent::HardwareStop(HardwareStop::Manual));
+        rig.say_event(n, RobotEvent::HardwareStop(HardwareStop::Manual));
         rig.ota_turn();
         assert_eq!(rig.rollout("ro").abort.is_some(), counts, "{later_ms}");
     }
@@ -239,13 +233,13 @@ fn no_permission_is_given_in_the_breath_in_which_a_hard_stop_is_heard() {
     let (a, b) = (rig.order()[0], rig.order()[1]);
     rig.robots[b].fate = Fate::NeverReady;
     rig.until(60, |r| r.step(a) == Step::Trial && r.step(b) == Step::Activating);
-    let drain_id = rig.of("ro", b).drain_id.expect("a drain");
+    let drain_id = rig.robot_in("ro", b).drain_id.expect("a drain");
     let set = crate::ids::SetId::parse("factory").expect("an id");
-    rig.say(b, RobotEvent::Update(UpdateEvent::Ready { drain_id, set }));
-    rig.say(a, fault(66));
+    rig.say_event(b, RobotEvent::Update(UpdateEvent::Ready { drain_id, set }));
+    rig.say_event(a, fault(66));
     rig.ota_turn();
     assert!(rig.phase().goes_back());
-    assert!(!rig.of("ro", b).attempted);
+    assert!(!rig.robot_in("ro", b).attempted);
 }
 
 #[test]
@@ -257,11 +251,11 @@ fn the_breaker_on_trial_counts_and_one_of_before_does_not() {
     rig.until(60, |r| r.step(n) == Step::Trial);
     rig.control(n, |c| c.breaker = Some(before));
     rig.tick();
-    assert_eq!(rig.of("ro", n).failure, None);
+    assert_eq!(rig.robot_in("ro", n).failure, None);
     let at = rig.now.utc;
     rig.control(n, |c| c.breaker = Some(at));
     rig.ota_turn();
-    assert_eq!(rig.of("ro", n).failure.expect("it failed").code, Code::BreakerOnTrial);
+    assert_eq!(rig.robot_in("ro", n).failure.expect("it failed").code, Code::BreakerOnTrial);
     assert!(rig.phase().goes_back());
 }
 
@@ -320,7 +314,7 @@ fn rules_of_an_area_in_which_no_robot_was_given_permission_end_nothing_and_rules
         let untouched = rig.order()[7];
         rig.robots[untouched].at = "door-2";
         rig.ticks(2);
-        assert!(!rig.of("ro", untouched).attempted);
+        assert!(!rig.robot_in("ro", untouched).attempted);
         let area = rig.ota.software_of(&robot_id(untouched)).area;
         assert_eq!(area.map(|a| a.to_string()).as_deref(), Some("quality"), "it is seen there");
     });
@@ -337,10 +331,10 @@ fn rules_of_an_area_with_a_robot_that_was_given_permission_and_never_ran_it_end_
         let dawdles = rig.order()[7];
         rig.robots[dawdles].at = "door-2";
         rig.ticks(2);
-        let given = RolloutRobot { attempted: true, ..rig.of("ro", dawdles) };
+        let given = RolloutRobot { attempted: true, ..rig.robot_in("ro", dawdles) };
         rig.put(given);
         rig.ota_turn();
-        let row = rig.of("ro", dawdles);
+        let row = rig.robot_in("ro", dawdles);
         assert!(row.attempted && row.moments.on_trial.is_none());
     });
     assert_eq!(ended_by(&rig), None);
@@ -361,7 +355,8 @@ fn a_robot_on_trial_that_drives_into_an_area_that_says_so_ends_it() {
 fn who_says_that_rates_end_it_is_told_before_it_begins() {
     let mut rig = Rig::new(4);
     let caveats = |rig: &Rig, spec: &RolloutSpec| {
-        let run = super::super::dry_run::dry_run(&rig.ota, &rig.board, &rollout_id("ro"), spec).expect("it may begin");
+        let run = crate::rollout::commands::dry_run::dry_run(&rig.ota, &rig.board, &rollout_id("ro"), spec)
+            .expect("it may begin");
         run.caveats.into_iter().filter(|c| c.starts_with("rates of task failures")).collect::<Vec<_>>()
     };
     quality_acts(&mut rig);
@@ -382,7 +377,8 @@ fn robots_that_come_and_go_keep_no_gate_waiting_and_who_is_dark_then_is_not_call
     rig.start(rules);
     rig.until(100, |r| r.phase() == Phase::Soaking);
     let wave: Vec<usize> = rig.order()[..11].to_vec();
-    // One second in 44 each, four seconds apart: less than a quarter is there at any moment, and all were heard in 44 seconds.
+    // One second in 44 each, four seconds apart: less than a quarter is there at any moment, and all were heard in 44
+    // seconds.
     for t in 0..120 {
         wave.iter().enumerate().for_each(|(i, n)| rig.robots[*n].is_off = t % 44 != i * 4);
         rig.tick();

@@ -1,9 +1,9 @@
 //! Whom a roll-out reaches, in which wave, and what is refused before it begins.
 
-use super::super::dry_run::dry_run;
-use super::super::matching;
 use super::*;
 use crate::ids::SetId;
+use crate::rollout::commands::dry_run::dry_run;
+use crate::rollout::members::matching;
 use crate::update::{Installed, InstalledSet};
 
 fn sizes(rig: &Rig, waves: Vec<Wave>) -> Vec<u32> {

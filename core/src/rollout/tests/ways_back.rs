@@ -21,7 +21,7 @@ fn left_another(n: usize) -> Rig {
     let mut next = RolloutSpec { bundle: bundle_id(3), waves: vec![Wave::Rest], allow_full_push: true, ..spec() };
     next.selector.robots.insert(robot_id(n));
     rig.start_as("next", next, false);
-    rig.until(60, |r| r.of("next", n).step == Step::Trial);
+    rig.until(60, |r| r.robot_in("next", n).step == Step::Trial);
     rig.must("next", Verb::Abort);
     rig.until(60, |r| r.rollout("next").phase == Phase::Aborted);
     assert_eq!(rig.robots[n].version, "2.0.0");
@@ -60,7 +60,7 @@ fn a_robot_that_keeps_nothing_is_stuck_and_its_abort_comes_to_its_end() {
     rig.must("ro", Verb::Abort);
     rig.until(100, |r| r.phase() == Phase::Aborted);
     assert_eq!((rig.step(n), rig.count(Step::RolledBack)), (Step::Stuck, 5));
-    assert_eq!(rig.of("ro", n).failure.expect("counted").code, Code::RollbackFailed);
+    assert_eq!(rig.robot_in("ro", n).failure.expect("counted").code, Code::RollbackFailed);
     let told = (robot_id(n).to_string(), Some("NOTHING_KEPT".to_owned()), Some("ro".to_owned()));
     assert_eq!(stuck(&rig), [told]);
     assert_eq!(rig.rollout("ro").in_flight, 1, "it stays out of work");
@@ -117,8 +117,8 @@ fn a_stuck_robot_that_was_set_up_anew_is_told_as_back_and_one_that_runs_the_bund
 
 /// What a robot waits for, and what a person can do.
 fn waits_for(rig: &Rig, n: usize) -> Option<Reason> {
-    let (rollout, r) = (rig.rollout("ro"), rig.of("ro", n));
-    super::super::explain::blocked(&rig.ota, &rig.board, &rig.now, &rollout, &r).map(|blocked| blocked.by)
+    let (rollout, r) = (rig.rollout("ro"), rig.robot_in("ro", n));
+    crate::rollout::explain::blocked(&rig.ota, &rig.board, &rig.now, &rollout, &r).map(|blocked| blocked.by)
 }
 
 /// The robot waits for a person to say whose machine shows this key, and no order is signed for it.
@@ -138,13 +138,7 @@ fn accept(rig: &mut Rig, n: usize, device_key: String) {
 
 #[test]
 fn no_order_back_is_signed_for_a_machine_with_another_key_until_a_person_takes_it() {
-    let mut rig = Rig::new(4);
-    rig.start(spec());
-    let n = rig.order()[0];
-    rig.until(60, |r| r.step(n) == Step::Trial);
-    rig.must("ro", Verb::Abort);
-    rig.robots[n].is_off = true;
-    rig.until(60, |r| r.step(n) == Step::Reverting);
+    let (mut rig, n) = canary_on_its_way_back();
     // What it was told is gone, as after a restore: only a directive of its own can tell it again.
     let last = section(&rig, n).generation;
     rig.write(Key::new(DesiredUpdate::TABLE, robot_id(n).as_str()), None, "test.gone");
@@ -163,16 +157,16 @@ fn a_roll_out_that_takes_another_back_waits_for_nobody_whose_key_a_person_must_t
     let mut rig = left_another(n);
     rig.robots[n].fate = Fate::Stubborn;
     take_back(&mut rig);
-    rig.until(60, |r| r.of("back", n).way_back.generation > 0);
+    rig.until(60, |r| r.robot_in("back", n).way_back.generation > 0);
     let first = section(&rig, n).directive;
     let device_key = rig.shows_another_key(n);
     rig.until(200, |r| r.rollout("back").phase == Phase::Completed);
-    let r = rig.of("back", n);
+    let r = rig.robot_in("back", n);
     assert_eq!((r.step, r.way_back.refused.is_some()), (Step::Reverting, true), "it is not ordered back anew");
     assert_eq!(section(&rig, n).directive, first);
     rig.robots[n].fate = Fate::Good;
     accept(&mut rig, n, device_key);
-    rig.until(60, |r| r.of("back", n).step == Step::RolledBack);
+    rig.until(60, |r| r.robot_in("back", n).step == Step::RolledBack);
     assert_ne!(section(&rig, n).directive, first);
 }
 
@@ -221,9 +215,9 @@ fn what_a_robot_says_of_an_older_order_says_nothing_of_the_newest() {
     rig.must("ro", Verb::Abort);
     rig.until(60, |r| section(r, n).goal == Goal::Revert);
     let reason = Code::NothingKept.into();
-    rig.say(n, RobotEvent::Update(UpdateEvent::DirectiveRefused { generation: before, reason }));
+    rig.say_event(n, RobotEvent::Update(UpdateEvent::DirectiveRefused { generation: before, reason }));
     rig.ota_turn();
-    assert_eq!((rig.step(n), rig.of("ro", n).way_back.refused), (Step::Reverting, None));
+    assert_eq!((rig.step(n), rig.robot_in("ro", n).way_back.refused), (Step::Reverting, None));
 }
 
 #[test]
@@ -231,7 +225,7 @@ fn an_order_to_go_back_that_lies_too_long_is_signed_anew_for_a_robot_that_is_awa
     let n = 2;
     let mut rig = left_another(n);
     take_back(&mut rig);
-    rig.until(60, |r| r.of("back", n).way_back.generation > 0);
+    rig.until(60, |r| r.robot_in("back", n).way_back.generation > 0);
     // It is told so, and falls silent before it has read it.
     rig.robots[n].is_off = true;
     let first = section(&rig, n).directive;
@@ -239,10 +233,10 @@ fn an_order_to_go_back_that_lies_too_long_is_signed_anew_for_a_robot_that_is_awa
         rig.pass(DAY_MS);
         rig.turn();
     }
-    assert_eq!(rig.of("back", n).step, Step::Reverting);
+    assert_eq!(rig.robot_in("back", n).step, Step::Reverting);
     assert_ne!(section(&rig, n).directive, first);
     rig.robots[n].is_off = false;
-    rig.until(20, |r| r.of("back", n).step == Step::RolledBack);
+    rig.until(20, |r| r.robot_in("back", n).step == Step::RolledBack);
     assert_eq!((rig.robots[n].version.as_str(), stuck(&rig).len()), ("0.9.0", 0));
 }
 
@@ -251,10 +245,10 @@ fn an_order_that_was_taken_is_not_signed_anew_however_long_the_robot_takes() {
     let n = 2;
     let mut rig = left_another(n);
     take_back(&mut rig);
-    rig.until(60, |r| r.of("back", n).way_back.generation > 0);
+    rig.until(60, |r| r.robot_in("back", n).way_back.generation > 0);
     let generation = section(&rig, n).generation;
     // It took it, and is switched off before it goes back.
-    rig.tell(n, fresh_report(UpdateState::Committed, &bundle_id(2), generation));
+    rig.report_update(n, fresh_report(UpdateState::Committed, &bundle_id(2), generation));
     rig.ota_turn();
     rig.robots[n].is_off = true;
     for _ in 0..8 {
@@ -280,7 +274,7 @@ fn an_order_to_fetch_that_lay_too_long_while_the_server_was_away_leaves_nobody_o
     rig.robot_acts(1);
     assert_eq!(rig.robots[1].judged, first, "it is too old");
     rig.ticks(3);
-    let r = rig.of("ro", 1);
+    let r = rig.robot_in("ro", 1);
     assert!(r.why.is_none() && matches!(r.step, Step::Staged | Step::Draining), "{:?} {:?}", r.why, r.step);
 }
 
@@ -290,13 +284,13 @@ fn whom_only_a_signed_order_leads_back_stays_at_work_until_there_is_a_key() {
     rig.keyless = true;
     take_back(&mut rig);
     rig.ticks(120);
-    let waits = rig.of("back", 1);
+    let waits = rig.robot_in("back", 1);
     assert_eq!((waits.step, waits.drain_id), (Step::Staged, None), "out of work it would keep others from going back");
     assert_eq!(rig.robots[1].version, "2.0.0");
     assert!(
         (0..4)
             .filter(|n| *n != 1)
-            .any(|n| rig.of("back", n).step == Step::RolledBack || rig.robots[n].version == "0.9.0")
+            .any(|n| rig.robot_in("back", n).step == Step::RolledBack || rig.robots[n].version == "0.9.0")
     );
     rig.keyless = false;
     rig.until(300, |r| r.rollout("back").phase == Phase::Completed);

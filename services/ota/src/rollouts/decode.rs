@@ -3,8 +3,8 @@
 use midshift_core::gates::EffortLimits;
 use midshift_core::ids::{AreaId, BundleId, RobotId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
+use midshift_core::rollout::projection::View;
 use midshift_core::rollout::spec::{RolloutSpec, Selector, Wave};
-use midshift_core::rollout::view::View;
 use midshift_proto::convert::{At, WireEnum, parse_ms};
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::rollout_wave::Size;
@@ -26,7 +26,8 @@ pub fn bundle(view: &View, text: &str) -> Result<BundleId, Refusal> {
     newest.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))
 }
 
-/// A spec as a caller wrote it, with every default in its place; that of the probation is the server's, in milliseconds of site time.
+/// A spec as a caller wrote it, with every default in its place; that of the probation is the server's, in milliseconds
+/// of site time.
 pub fn spec(wire: &v1::RolloutSpec, bundle: BundleId, probation_ms: u64, bad: &mut Violations) -> RolloutSpec {
     let default = RolloutSpec { probation_ms, ..RolloutSpec::new(bundle) };
     let at = At::top("spec");

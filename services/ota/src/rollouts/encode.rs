@@ -4,11 +4,11 @@ use midshift_core::gates::{Effort, EffortLimits, Suspicion, TaskTally};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::dry_run::DryRun;
 use midshift_core::rollout::explain::blocked;
+use midshift_core::rollout::projection::View;
 use midshift_core::rollout::rows::{Abort, Act, Quarantine, RobotSoftware, Rollout, RolloutRobot, Step, Verdict};
 use midshift_core::rollout::spec::{RolloutSpec, Wave};
-use midshift_core::rollout::stamp::Stamp;
+use midshift_core::rollout::timestamp::Stamp;
 use midshift_core::rollout::verdict::{self, ActsOnRates};
-use midshift_core::rollout::view::View;
 use midshift_core::rows::Revision;
 use midshift_core::time::{Now, Utc};
 use midshift_proto::convert::task::etag;
@@ -197,7 +197,7 @@ pub fn counted(view: &View, now: &Now, row: &Rollout, counts: Counts) -> v1::Rol
         in_flight: row.in_flight,
         soak_left: left(row.soak),
         exposure_left: left(row.exposure),
-        unexposed: verdict::unexposed(view, row).count() as u32,
+        unexposed: verdict::find_unexposed(view, row).count() as u32,
         verdicts: row.verdicts.iter().map(verdict_of).collect(),
         abort: row.abort.as_ref().map(abort),
         revert_of: text(row.revert_of.as_ref()),

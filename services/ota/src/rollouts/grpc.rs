@@ -9,9 +9,9 @@ use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal, Violations};
 use midshift_core::rollout::dry_run::dry_run;
 use midshift_core::rollout::objects;
+use midshift_core::rollout::projection::View;
 use midshift_core::rollout::requests::{CheckOnly, Command, Taken, Verb};
 use midshift_core::rollout::rows::{Quarantine, Rollout};
-use midshift_core::rollout::view::View;
 use midshift_proto::access::caller;
 use midshift_proto::convert::task::revision_of;
 use midshift_proto::convert::timestamp;
@@ -24,7 +24,8 @@ use std::time::Duration;
 use tokio::time::Instant;
 use tonic::{Request, Response, Status};
 
-/// So long a caller waits for the row of a bundle that is published: the process that plans writes it within a second, and another takes over within 5.
+/// So long a caller waits for the row of a bundle that is published: the process that plans writes it within a second,
+/// and another takes over within 5.
 const ROWS_COME: Duration = Duration::from_secs(8);
 const ROWS_LOOK: Duration = Duration::from_millis(50);
 
@@ -93,8 +94,8 @@ impl RobotCall {
 impl RolloutService {
     async fn shown(&self, rollout_id: RolloutId, by: &Caller) -> Result<v1::Rollout, Refusal> {
         let by = by.clone();
-        self.look_about(vec![rollout_id.clone()], move |view, _, now| {
-            Ok(encode::rollout(view, now, objects::seen(view, &by, &rollout_id)?))
+        self.ask_about(vec![rollout_id.clone()], move |view, _, now| {
+            Ok(encode::rollout(view, now, objects::find_seen(view, &by, &rollout_id)?))
         })
         .await?
     }
@@ -127,12 +128,13 @@ impl RolloutService {
         Ok((self.shown(rollout_id, about.by).await?, taken))
     }
 
-    /// The bundle that a caller names. One that is published and has no row yet is waited for: whoever has just pushed it asks another process.
+    /// The bundle that a caller names. One that is published and has no row yet is waited for: whoever has just pushed
+    /// it asks another process.
     async fn bundle(&self, text: &str) -> Result<BundleId, Refusal> {
         let until = Instant::now() + ROWS_COME;
         loop {
             let named = text.to_owned();
-            let found = self.look(move |view, _, _| decode::bundle(view, &named)).await?;
+            let found = self.ask_projection(move |view, _, _| decode::bundle(view, &named)).await?;
             let is_late = found.is_err() && Instant::now() < until && self.is_published(text).await?;
             if !is_late {
                 return found;
@@ -179,7 +181,7 @@ impl RolloutService {
             self.bundle(&spec.bundle).await?;
         }
         let (probation_ms, by, about) = (self.probation_ms, by.clone(), vec![rollout_id.clone()]);
-        self.look_about(about, move |view, board, _| {
+        self.ask_about(about, move |view, board, _| {
             let spec = match r.spec {
                 Some(wire) => {
                     let bundle = decode::bundle(view, &wire.bundle)?;
@@ -188,7 +190,7 @@ impl RolloutService {
                     bad.finish()?;
                     Arc::new(spec)
                 }
-                None => objects::seen(view, &by, &rollout_id)?.spec.clone(),
+                None => objects::find_seen(view, &by, &rollout_id)?.spec.clone(),
             };
             by.needs(Permission::Author, &spec.selector.areas)?;
             let run = dry_run(view, board, &rollout_id, &spec)?;
@@ -246,8 +248,8 @@ impl RolloutService {
         let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
         bad.finish()?;
         let (rollout_id, by) = (rollout_id.ok_or_else(internal)?, by.clone());
-        self.look_about(vec![rollout_id.clone()], move |view, board, now| {
-            let row = objects::seen(view, &by, &rollout_id)?;
+        self.ask_about(vec![rollout_id.clone()], move |view, board, now| {
+            let row = objects::find_seen(view, &by, &rollout_id)?;
             let asked = |id: &RobotId| r.robot_id.is_empty() || id.as_str() == r.robot_id;
             let rows = view.robots_of(&rollout_id).filter(|r| asked(&r.robot_id));
             let (rows, next_page_token) = pages::page(rows.map(|r| (r.robot_id.to_string(), r)), &r.page_token, size);
@@ -265,7 +267,7 @@ impl RolloutService {
         let bundle = self.bundle(&r.bundle).await?;
         let command = Command::Revoke { bundle: bundle.clone(), reason: r.reason };
         let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
-        self.look(move |view, _, _| {
+        self.ask_projection(move |view, _, _| {
             let of = view.rollouts.values().map(|r| &r.row).filter(|r| r.spec.bundle == bundle && !r.phase.is_over());
             let (back, still): (Vec<&Rollout>, Vec<_>) = of.partition(|r| r.phase.goes_back() || r.revert_of.is_some());
             let ids = |of: Vec<&Rollout>| of.into_iter().map(|r| r.rollout_id.to_string()).collect();
@@ -276,7 +278,8 @@ impl RolloutService {
         .await
     }
 
-    /// Carries out a command about the software of one robot. Answers with what the robot runs after it, and when it was done before.
+    /// Carries out a command about the software of one robot. Answers with what the robot runs after it, and when it
+    /// was done before.
     async fn act_on_robot(
         &self,
         call: RobotCall,
@@ -287,7 +290,8 @@ impl RolloutService {
         let robot_id = call.robot_id.ok_or_else(internal)?;
         let command = command(robot_id.clone());
         let taken = self.act_once(command, by, None, call.check_only, call.request_id).await?;
-        let software = self.look(move |view: &View, _, _| encode::software(&view.software_of(&robot_id))).await?;
+        let software =
+            self.ask_projection(move |view: &View, _, _| encode::software(&view.software_of(&robot_id))).await?;
         Ok((Some(software), done_before(taken)))
     }
 
@@ -336,7 +340,7 @@ impl RolloutService {
         let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
         let by = by.clone();
-        self.look(move |view, board, _| {
+        self.ask_projection(move |view, board, _| {
             let rows = view.software.iter().filter(|(id, _)| r.robot_id.is_empty() || **id == r.robot_id);
             let rows = rows.filter(|(_, s)| objects::sees_robot(view, board, &by, &s.row.robot_id));
             let (rows, next_page_token) = pages::page(rows.map(|(id, s)| (id.clone(), s)), &r.page_token, size);
@@ -355,7 +359,7 @@ impl RolloutService {
         let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
         let by = by.clone();
-        self.look(move |view, board, _| {
+        self.ask_projection(move |view, board, _| {
             let seen = |q: &&Quarantine| objects::sees_robot(view, board, &by, &q.robot_id);
             let rows = view.quarantines.iter().filter(|(_, q)| seen(&&q.row)).map(|(id, q)| (id.clone(), q));
             let (rows, next_page_token) = pages::page(rows, &r.page_token, size);
@@ -374,7 +378,7 @@ impl RolloutService {
         let bundle = self.bundle(&r.bundle).await?;
         let command = Command::LiftQuarantine { robot_id: robot_id.clone(), bundle: bundle.clone() };
         let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
-        self.look(move |view, _, _| {
+        self.ask_projection(move |view, _, _| {
             let quarantine = view.quarantines.get(&Quarantine::id_of(&robot_id, &bundle));
             let quarantine = quarantine.map(|q| encode::quarantine(view, &q.row));
             v1::LiftQuarantineResponse { done_before: done_before(taken), quarantine }

@@ -1,5 +1,5 @@
-//! One page of roll-outs, newest first; of those whose ids begin alike, by id. The picture has none that ended long ago, so rows are read from
-//! the store.
+//! One page of roll-outs, newest first; of those whose ids begin alike, by id. The picture has none that ended long
+//! ago, so rows are read from the store.
 //!
 //! Invariant: a page costs its own roll-outs and their robots, whatever else has ended.
 
@@ -56,7 +56,7 @@ impl RolloutService {
             counted.push((rollout, counts));
         }
         let about = counted.iter().filter(|(_, counts)| counts.is_none()).map(|(r, _)| r.rollout_id.clone()).collect();
-        self.look_about(about, move |view, _, now| {
+        self.ask_about(about, move |view, _, now| {
             let shown = |(row, counts): (Rollout, Option<Counts>)| match view.rollout(&row.rollout_id) {
                 Some(row) => encode::rollout(view, now, row),
                 None => encode::counted(view, now, &row, counts.unwrap_or_default()),

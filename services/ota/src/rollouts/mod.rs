@@ -1,14 +1,16 @@
-//! Roll-outs as a service: reads the feed and the heartbeats, lets `core::rollout` decide, signs, commits, answers questions.
+//! Roll-outs as a service: reads the feed and the heartbeats, lets `core::rollout` decide, signs, commits, answers
+//! questions.
 //!
-//! Called by the binary: [`RolloutService::new`], its gRPC face, and [`Planner::run`]. Invariant: nothing is decided here; a lost wake costs one
-//! sweep; what is signed was decided by the planner and is committed with the row that explains it.
+//! Called by the binary: [`RolloutService::new`], its gRPC face, and [`Planner::run`]. Invariant: nothing is decided
+//! here; a lost wake costs one sweep; what is signed was decided by the planner and is committed with the row that
+//! explains it.
 
 mod decode;
 mod directives;
 mod encode;
+mod ended;
 mod grpc;
 mod list;
-mod past;
 mod reconcile;
 mod releases;
 mod standby;
@@ -25,9 +27,9 @@ use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::bugs::Bugs;
+use midshift_core::rollout::projection::View;
 use midshift_core::rollout::requests::{Ask, CheckOnly, Command, Taken};
 use midshift_core::rollout::spec::PROBATION_DEFAULT_MS;
-use midshift_core::rollout::view::View;
 use midshift_core::rows::{Revision, Seq};
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, Now};
@@ -63,7 +65,7 @@ pub struct Parts {
 type Answer = Box<dyn FnOnce(&View, &Board, &Now) + Send>;
 
 /// A question about the picture as it is now.
-struct Look {
+struct Question {
     /// Roll-outs that it is about: they are in the picture when it is answered, if they are there.
     about: Vec<RolloutId>,
     answer: Answer,
@@ -73,8 +75,8 @@ struct Look {
 enum Request {
     /// Change something; answered after the commit.
     Do(Box<Asked>),
-    /// Look at something.
-    Look(Look),
+    /// Read something.
+    Question(Question),
 }
 
 /// A command, until it is answered.
@@ -137,28 +139,29 @@ impl RolloutService {
             mpsc::error::TrySendError::Closed(_) => Refusal::new(Kind::Unavailable, Code::ShuttingDown),
         })
     }
-    /// Runs `look` on the picture and gives its answer. Of roll-outs that have ended the picture has only what something names.
+    /// Runs `look` on the picture and gives its answer. Of roll-outs that have ended the picture has only what
+    /// something names.
     ///
     /// # Errors
     /// If the planner does not run.
-    pub async fn look<T: Send + 'static>(
+    pub async fn ask_projection<T: Send + 'static>(
         &self,
         look: impl FnOnce(&View, &Board, &Now) -> T + Send + 'static,
     ) -> Result<T, Refusal> {
-        self.look_about(Vec::new(), look).await
+        self.ask_about(Vec::new(), look).await
     }
     /// The same, of a picture that has these roll-outs, ended or not.
     ///
     /// # Errors
     /// If the planner does not run.
-    pub async fn look_about<T: Send + 'static>(
+    pub async fn ask_about<T: Send + 'static>(
         &self,
         about: Vec<RolloutId>,
         look: impl FnOnce(&View, &Board, &Now) -> T + Send + 'static,
     ) -> Result<T, Refusal> {
         let (reply, answer) = oneshot::channel();
         let look = move |view: &View, board: &Board, now: &Now| drop(reply.send(look(view, board, now)));
-        self.send(Request::Look(Look { about, answer: Box::new(look) })).await?;
+        self.send(Request::Question(Question { about, answer: Box::new(look) })).await?;
         answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::ShuttingDown))
     }
     /// Carries out a command and waits for its commit.

@@ -1,21 +1,22 @@
-//! The loop: take what is new, decide, sign, commit. A conflict means that somebody else decided too: the picture is built again.
-//! Of several processes on one store one leads and does all that; the others keep their picture by rows alone (`standby`).
+//! The loop: take what is new, decide, sign, commit. A conflict means that somebody else decided too: the picture is
+//! built again. Of several processes on one store one leads and does all that; the others keep their picture by rows
+//! alone (`standby`).
 //!
-//! Invariant: the view has absorbed the whole feed before anything is decided on it; only a process that leads plans, takes releases and
-//! signs, and one that could not say so for a while reads the rows again before it does.
+//! Invariant: the view has absorbed the whole feed before anything is decided on it; only a process that leads plans,
+//! takes releases and signs, and one that could not say so for a while reads the rows again before it does.
 
 use super::directives::Signer;
-use super::{Asked, Look, Parts, Planner, Request, releases};
+use super::{Asked, Parts, Planner, Question, Request, releases};
 use crate::collect::Named;
 use midshift_core::ids::RobotId;
 use midshift_core::lead::{OtaLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rollout::named::named;
+use midshift_core::rollout::projection::View;
 use midshift_core::rollout::requests::{CheckOnly, Taken};
-use midshift_core::rollout::view::View;
-use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, commands, cycle, obeyed, past, tell_damaged};
+use midshift_core::rollout::retention::needed_bundles;
+use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, cycle, decide_request, ended, obeyed, tell_damaged};
 use midshift_core::rows::{Entry, Item, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
@@ -45,7 +46,7 @@ pub(super) struct Loop {
     /// Serving time at which it is said next which bundles are needed, milliseconds.
     say_at_ms: u64,
     /// Questions that are answered once what they would see is committed.
-    pub(super) looks: Vec<Look>,
+    pub(super) questions: Vec<Question>,
     /// Whether this process leads.
     pub(super) seat: Seat<OtaLeader>,
     /// What this process wrote and has not read again.
@@ -85,7 +86,7 @@ pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Er
         started,
         changed,
         say_at_ms: 0,
-        looks: Vec::new(),
+        questions: Vec::new(),
         seat,
         own: Own::default(),
         again: Vec::new(),
@@ -118,8 +119,8 @@ pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Er
     Ok(())
 }
 
-/// From where the log can be read on: `after`, or its oldest entry if what stands between went while no process of roll-outs was there. Rows say
-/// what became of it, and robots say again how they are.
+/// From where the log can be read on: `after`, or its oldest entry if what stands between went while no process of
+/// roll-outs was there. Rows say what became of it, and robots say again how they are.
 async fn reachable(store: &dyn Store, after: Seq) -> Result<Seq, Error> {
     match store.feed(after, LOGS, 1).await {
         Err(Error::CursorExpired { asked, oldest }) if asked < oldest => {
@@ -192,14 +193,15 @@ impl Loop {
         self.take_part().await?;
         self.own.clear();
         let Self { seat, parts, .. } = self;
-        let parts_read = past::alive();
-        let reading = parts.store.read(&parts_read, past::named);
+        let parts_read = ended::alive();
+        let reading = parts.store.read(&parts_read, ended::named);
         let snapshot = lead::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
         let now = self.parts.clock.now();
         let served = self.view.served_ms(&now);
-        let (unusable, contacts) = (std::mem::take(&mut self.view.unusable), std::mem::take(&mut self.view.contacts));
-        self.view = View { unusable, contacts, ..View::new(self.parts.site.clone(), self.started, now) };
-        self.view.bugs = self.parts.bugs;
+        let mut next = View::new(self.parts.site.clone(), self.started, now);
+        next.bugs = self.parts.bugs;
+        next.carry_over(&mut self.view);
+        self.view = next;
         self.view.load(&snapshot.rows, snapshot.seq)?;
         // The row is as old as the last commit; this process has served on since.
         self.view.served.site_ms = self.view.served.site_ms.max(served);
@@ -222,7 +224,7 @@ impl Loop {
 
     /// One turn; true: there is more to do at once. An error: the picture can no longer be trusted.
     async fn turn(&mut self, requests: Vec<Request>) -> Result<bool, ()> {
-        self.hear();
+        self.take_heartbeats();
         let unreadable = |error| tracing::warn!(%error, "roll-outs cannot read the store");
         // What the clock says comes first: a process that was away decides nothing before it has read who leads.
         if self.seat.stance(self.parts.clock.now().link) == Stance::StepDown {
@@ -239,7 +241,7 @@ impl Loop {
     }
 
     /// Takes what robots said since.
-    fn hear(&mut self) {
+    fn take_heartbeats(&mut self) {
         for (robot_id, live) in self.dirty.take() {
             match live {
                 Some(live) => {
@@ -301,7 +303,7 @@ impl Loop {
         let Ok(opened) = ota.opened() else { return Ok(false) };
         // Rows that another process committed from what it published are not undone.
         opened.repository.documents().look_if_possible().await;
-        releases::take(&mut self.view, now, opened.repository.newest().as_deref(), &mut plan);
+        releases::take_release(&mut self.view, now, opened.repository.newest().as_deref(), &mut plan);
         let damaged = opened.hatch.damaged();
         for digest in &damaged {
             tell_damaged(&mut self.view, now, &digest.to_string(), &mut plan);
@@ -336,15 +338,15 @@ impl Loop {
             self.say_at_ms = served_ms + limits::COLLECT_EVERY_MS;
             self.view.forget_contacts(&self.board);
             // From rows that are committed, as answers are.
-            opened.named.send_replace(Some(Named { bundles: named(&self.view, &now), served_ms }));
+            opened.named.send_replace(Some(Named { bundles: needed_bundles(&self.view, &now), served_ms }));
         }
         Ok(more)
     }
 
     /// Answers every question from the picture, which holds only what is committed at this moment.
     pub(super) fn answer(&mut self, now: Now) {
-        for look in std::mem::take(&mut self.looks) {
-            (look.answer)(&self.view, &self.board, &now);
+        for question in std::mem::take(&mut self.questions) {
+            (question.answer)(&self.view, &self.board, &now);
         }
     }
 
@@ -352,10 +354,10 @@ impl Loop {
         let mut replies = Vec::new();
         for request in requests {
             match request {
-                Request::Look(look) => self.looks.push(look),
+                Request::Question(question) => self.questions.push(question),
                 Request::Do(asked) => {
                     let before = plan.items.len();
-                    let taken = commands::take(&mut self.view, &self.board, now, &asked.ask, plan);
+                    let taken = decide_request(&mut self.view, &self.board, now, &asked.ask, plan);
                     let after = plan.items.len();
                     match taken {
                         Ok(taken) if asked.ask.check_only == CheckOnly::No => {

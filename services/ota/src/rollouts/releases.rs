@@ -1,7 +1,7 @@
 //! Bundles of the newest release as rows: what the planner knows of them.
 //!
-//! Invariant: nothing is deleted here: a bundle that the release lists no more is unlisted, and its row stays as long as something names it
-//! ([`crate::retention`]).
+//! Invariant: nothing is deleted here: a bundle that the release lists no more is unlisted, and its row stays as long
+//! as something names it ([`crate::retention`]).
 
 use crate::repository::{By, Newest};
 use midshift_bundle::digest::Digest;
@@ -11,8 +11,8 @@ use midshift_core::identity::Actor;
 use midshift_core::ids::BundleId;
 use midshift_core::limits;
 use midshift_core::rollout::Plan;
+use midshift_core::rollout::projection::View;
 use midshift_core::rollout::rows::Bundle;
-use midshift_core::rollout::view::View;
 use midshift_core::rows::Table;
 use midshift_core::task::raw::parse_version;
 use midshift_core::time::Now;
@@ -28,7 +28,7 @@ pub async fn known_bundles(store: &dyn Store) -> Result<usize, midshift_store::E
 }
 
 /// Makes the rows say what the release says.
-pub fn take(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan) {
+pub fn take_release(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan) {
     let releases = newest.map(|newest| newest.releases.as_slice()).unwrap_or_default();
     let mut changed = Vec::new();
     let mut listed = BTreeSet::new();
@@ -67,7 +67,8 @@ pub fn take(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan)
     }
 }
 
-/// Who listed a bundle, or published the release that lists it no more. Of a release that an older version of midshift took nobody knows.
+/// Who listed a bundle, or published the release that lists it no more. Of a release that an older version of midshift
+/// took nobody knows.
 fn publisher(newest: Option<&Newest>, row: &Bundle) -> Actor {
     let by = newest.map(|newest| &newest.by);
     let digest = row.bundle.as_str().parse::<Digest>().ok();
@@ -100,7 +101,8 @@ fn fresh(bundle: BundleId, manifest: &Manifest, manifest_length: u64, published:
     }
 }
 
-/// Bytes that a robot needs free while it fetches it. A file that comes encoded is there until its component is made of it.
+/// Bytes that a robot needs free while it fetches it. A file that comes encoded is there until its component is made of
+/// it.
 fn room(manifest: &Manifest) -> u64 {
     let longest = manifest.components.iter().map(|c| c.length).max().unwrap_or_default();
     let base = manifest.components.iter().filter(|c| c.kind == ComponentKind::Base).map(|c| c.length);

@@ -1,17 +1,16 @@
 //! A process that does not lead: it keeps its picture by rows alone, answers from it, and carries out what people ask.
 //!
-//! Invariant: it decides nothing but commands, tells nothing but that a file which it was to hand out is damaged, and signs nothing. A command is
-//! decided on the picture, committed on the condition that nothing of it has changed, and decided anew if something has; the process that leads
-//! obeys what is written.
+//! Invariant: it decides nothing but commands, tells nothing but that a file which it was to hand out is damaged, and
+//! signs nothing. A command is decided on the picture, committed on the condition that nothing of it has changed, and
+//! decided anew if something has; the process that leads obeys what is written.
 
 use super::Request;
 use super::reconcile::Loop;
 use midshift_core::limits;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rollout::commands;
 use midshift_core::rollout::requests::{Ask, Taken};
-use midshift_core::rollout::{LOGS, Plan, follow_rows, reread, tell_damaged};
+use midshift_core::rollout::{LOGS, Plan, decide_request, follow_rows, reread, tell_damaged};
 use midshift_core::rows::{Entry, Log, Table};
 use midshift_store::{CommitError, Error, follow};
 use std::sync::Arc;
@@ -50,7 +49,7 @@ impl Loop {
         let mut trusted = Ok(());
         for request in requests {
             match request {
-                Request::Look(look) => self.looks.push(look),
+                Request::Question(question) => self.questions.push(question),
                 Request::Do(asked) => {
                     let answer = match trusted {
                         Ok(()) => self.carry_out(&asked.ask).await,
@@ -95,7 +94,7 @@ impl Loop {
     async fn carry_out(&mut self, ask: &Ask) -> Result<Result<Taken, Refusal>, Error> {
         for _ in 0..limits::COMMAND_TRIES {
             let mut plan = Plan::default();
-            let taken = commands::take(&mut self.view, &self.board, self.parts.clock.now(), ask, &mut plan);
+            let taken = decide_request(&mut self.view, &self.board, self.parts.clock.now(), ask, &mut plan);
             self.view.arrived.clear();
             if taken.is_err() {
                 // That it was refused; whoever asked hears why, whether or not that can be written down.

@@ -1,17 +1,18 @@
 //! A roll-out as it goes: now, and with each change, until it has ended.
 //!
-//! What is told changes with rows, with tasks that end on trial, with what robots say of their downloads, and with time. Rows of this service
-//! wake a watcher; for the rest it looks again each second.
+//! What is told changes with rows, with tasks that end on trial, with what robots say of their downloads, and with
+//! time. Rows of this service wake a watcher; for the rest it looks again each second.
 //!
-//! Invariant: each look is answered from a picture that has come up to the head of the feed since it was asked for, whether the process leads
-//! or not, and holds committed rows alone. So a client that goes on at another process is told no older row than it was told before.
+//! Invariant: each look is answered from a picture that has come up to the head of the feed since it was asked for,
+//! whether the process leads or not, and holds committed rows alone. So a client that goes on at another process is
+//! told no older row than it was told before.
 
 use super::{RolloutService, encode};
 use midshift_core::gates::TaskTally;
 use midshift_core::identity::Caller;
 use midshift_core::ids::RolloutId;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::rollout::view::View;
+use midshift_core::rollout::projection::View;
 use midshift_core::rollout::{Board, objects, verdict};
 use midshift_core::rows::Revision;
 use midshift_core::time::Now;
@@ -111,7 +112,7 @@ pub async fn watch(
         changed.mark_unchanged();
         let (asked, by) = (id.clone(), by.clone());
         let looked = service
-            .look_about(vec![id.clone()], move |view, board, now| {
+            .ask_about(vec![id.clone()], move |view, board, now| {
                 let next = told.next(view, board, now, &asked, &by);
                 (told, next)
             })

@@ -1,8 +1,9 @@
-//! Two processes of the rollout service over one store and one folder: one plans and signs, the other carries out what people ask.
+//! Two processes of the rollout service over one store and one folder: one plans and signs, the other carries out what
+//! people ask.
 
 mod damage;
+mod ended;
 mod moves;
-mod past;
 mod reach;
 
 use crate::content::Room;
@@ -155,7 +156,7 @@ impl Process {
     }
     async fn phase(&self, id: &str) -> Option<Phase> {
         let id = RolloutId::parse(id).expect("an id");
-        self.face.look(move |view, _, _| view.rollout(&id).map(|r| r.phase)).await.expect("it runs")
+        self.face.ask_projection(move |view, _, _| view.rollout(&id).map(|r| r.phase)).await.expect("it runs")
     }
 }
 
@@ -290,8 +291,9 @@ async fn a_process_that_takes_over_without_a_current_directive_key_says_so_and_g
     let file = world.dir.path().join("keys/directive-2.pem");
     std::fs::remove_file(&file).expect("the next process was not given it");
     let next = world.process().await;
-    let keyless =
-        async |process: &Process| process.face.look(|view, _, _| view.keyless.is_some()).await.expect("it runs");
+    let keyless = async |process: &Process| {
+        process.face.ask_projection(|view, _, _| view.keyless.is_some()).await.expect("it runs")
+    };
     assert!(!keyless(&leader).await);
     leader.end().await;
     secs(6).await;

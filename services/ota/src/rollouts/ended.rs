@@ -1,0 +1,49 @@
+//! Roll-outs that have ended, and used request_ids: read from the store when somebody asks for them, or when the
+//! picture names them.
+//!
+//! Invariant: a roll-out is read with all its robots, at one moment.
+
+use super::Request;
+use super::reconcile::Loop;
+use midshift_core::ids::RolloutId;
+use midshift_core::rollout::ended;
+use midshift_core::rows::{Key, Part, Table};
+use midshift_store::Error;
+use std::collections::BTreeSet;
+
+/// What is to be read.
+pub(super) struct Wanted {
+    /// Roll-outs that the picture names.
+    named: BTreeSet<RolloutId>,
+    keys: Vec<Key>,
+}
+
+impl Loop {
+    /// What the picture, `requests` and open questions want to know and is not in the picture.
+    pub(super) fn wanted(&self, requests: &[Request]) -> Wanted {
+        let named = self.view.wanted();
+        let mut ids: BTreeSet<RolloutId> =
+            self.questions.iter().flat_map(|question| &question.about).cloned().collect();
+        let mut keys = Vec::new();
+        for request in requests {
+            match request {
+                Request::Question(question) => ids.extend(question.about.iter().cloned()),
+                Request::Do(asked) => {
+                    ids.extend(asked.ask.command.rollouts().into_iter().cloned());
+                    keys.extend(asked.ask.request_id.iter().map(|id| Key::new(Table::OtaCommandKey, id)));
+                }
+            }
+        }
+        ids.retain(|id| !self.view.rollouts.contains_key(id.as_str()));
+        keys.extend(ids.union(&named).map(|id| Key::new(Table::Rollout, id.as_str())));
+        Wanted { named, keys }
+    }
+    /// Reads it into the picture.
+    pub(super) async fn read_wanted(&mut self, Wanted { named, keys }: Wanted) -> Result<(), Error> {
+        if keys.is_empty() {
+            return Ok(());
+        }
+        let snapshot = self.parts.store.read(&[Part::Rows(keys), ended::robots()], ended::named).await?;
+        Ok(self.view.absorb_past(named, &snapshot.rows)?)
+    }
+}
