@@ -1,7 +1,8 @@
-//! All simulated robots of one process in their hall: who stands where at the start, who can be laid hands on, what came of it.
+//! All simulated robots of one process in their hall: who stands where at the start, who can be laid hands on, what
+//! came of it.
 //!
-//! Invariant: with everything in memory all bodies share one world and one journal; in a directory each body has its own, so
-//! that its process may die alone. Called by the swarm, the simulator's service and the binary's report.
+//! Invariant: with everything in memory all bodies share one world and one journal; in a directory each body has its
+//! own, so that its process may die alone. Called by the swarm, the simulator's service and the binary's report.
 
 use crate::body::{self, BodyConfig, Counts, JOURNAL_FILE, SimBody};
 use crate::faults::{FaultRates, Injected};

@@ -29,7 +29,8 @@ pub struct Verdict {
     pub items_on_robots: u64,
     /// Of these, gone from full places.
     pub items_shipped: u64,
-    /// Effects that no honest world can show: an item made twice, picked where it was not, put down by nobody who had it.
+    /// Effects that no honest world can show: an item made twice, picked where it was not, put down by nobody who had
+    /// it.
     pub items_broken: u64,
     /// Entries into a place that was full at that moment.
     pub exclusion_violations: u64,

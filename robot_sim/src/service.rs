@@ -1,6 +1,7 @@
 //! The simulator's own face on the wire: faults in, bodies and the world of items out.
 //!
-//! Invariant: what it answers comes from the bodies and their journals, never from the server. Registered by `dev` and `sim run` only.
+//! Invariant: what it answers comes from the bodies and their journals, never from the server. Registered by `dev` and
+//! `sim run` only.
 
 use crate::body::SimBody;
 use crate::faults::Injected;

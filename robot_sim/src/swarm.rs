@@ -1,7 +1,7 @@
 //! A swarm: one agent for each body of a hall, in one process, with the person who walks among them.
 //!
-//! Invariant: each agent is the one a real robot runs, unchanged; only its body, its network and its crashes are simulated.
-//! Called by `dev`, `sim run`, the bench and the tests.
+//! Invariant: each agent is the one a real robot runs, unchanged; only its body, its network and its crashes are
+//! simulated. Called by `dev`, `sim run`, the bench and the tests.
 
 use crate::hall::{Hall, Persistence};
 use crate::handle::SimHandle;
@@ -16,7 +16,7 @@ use midshift_agent::memory::MemoryStore;
 use midshift_agent::session::{self, AgentConfig, Lines};
 use midshift_agent::sets;
 use midshift_agent::sqlite::SqliteStore;
-use midshift_agent::starts::HANG_SECONDS;
+use midshift_agent::start_policy::HANG_SECONDS;
 use midshift_agent::stop::keep::{FileStops, KeepStops, MemoryStops, STOP_FILE};
 use midshift_agent::stop::line::StopLine;
 use midshift_agent::store::{self, Store};
@@ -174,7 +174,8 @@ impl Swarm {
         let crashes = config.hall.robots().iter().map(|r| (r.robot_id().clone(), Notify::new()));
         Self { crashes: Arc::new(crashes.collect()), config }
     }
-    /// Crashes one agent: its task is dropped where it is, its body stands, and it is started again from what it had kept.
+    /// Crashes one agent: its task is dropped where it is, its body stands, and it is started again from what it had
+    /// kept.
     pub fn crash(&self) -> Crash {
         let crashes = self.crashes.clone();
         Arc::new(move |robot_id| crashes.get(robot_id).inspect(|c| c.notify_one()).is_some())
@@ -370,7 +371,8 @@ impl Life {
             pulse: launched.map(Launched::pulse),
         })
     }
-    /// Its way to the stop service, if the swarm has one, and what it keeps of stops: across its crashes, as a disk would.
+    /// Its way to the stop service, if the swarm has one, and what it keeps of stops: across its crashes, as a disk
+    /// would.
     fn stop_line(&self) -> Result<Option<StopLine>, Error> {
         let Some(dial) = &self.config.stop else { return Ok(None) };
         let robot_id = self.robot.robot_id();

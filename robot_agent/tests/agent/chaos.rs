@@ -1,4 +1,5 @@
-//! A robot among lost messages, kills, slow disks and careless orders: what must hold after each step, whatever came before.
+//! A robot among lost messages, kills, slow disks and careless orders: what must hold after each step, whatever came
+//! before.
 
 use crate::rig::{Rig, TestBody, action, goto, place_id, point};
 use midshift_agent::bugs::{Bugs, SeededBug};
@@ -121,13 +122,13 @@ impl Judge {
             Act::Reach => {
                 if !self.rig.body.goes_to().is_empty() && !self.rig.body.log().paused {
                     self.rig.body.reach();
-                    self.rig.put(Input::Tick);
+                    self.rig.give(Input::Tick);
                 }
             }
             Act::Done => {
                 if self.rig.body.log().acting.is_some() && !self.rig.body.log().paused {
                     self.rig.body.done();
-                    self.rig.put(Input::Tick);
+                    self.rig.give(Input::Tick);
                 }
             }
             Act::Desire { epoch, fresh, grants, released, stop, suspend, held } => {
@@ -138,7 +139,7 @@ impl Judge {
                 self.rig.work(self.rig.desired(None));
             }
             Act::Reconnect => {
-                self.rig.put(Input::Disconnected);
+                self.rig.give(Input::Disconnected);
                 self.new_session();
             }
             Act::Kill => self.kill(),

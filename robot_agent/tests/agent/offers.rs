@@ -236,9 +236,9 @@ fn work_that_cannot_be_read_ends_no_session_and_the_robot_says_so() {
 fn the_second_fence_ends_the_process() {
     let mut rig = Rig::at("A");
     rig.connect();
-    rig.put(Input::Fenced);
+    rig.give(Input::Fenced);
     assert_eq!(rig.exit, None);
     rig.connect();
-    rig.put(Input::Fenced);
+    rig.give(Input::Fenced);
     assert_eq!(rig.exit, Some(ExitReason::FencedTwice));
 }

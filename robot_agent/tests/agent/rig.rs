@@ -1,4 +1,5 @@
-//! A robot on a bench: the core with a body that does what the test says, a store that keeps, and a server that is the test.
+//! A robot on a bench: the core with a body that does what the test says, a store that keeps, and a server that is the
+//! test.
 
 use crate::crowded::CrowdedSets;
 use crate::release::Releases;
@@ -281,7 +282,7 @@ pub struct Updates {
 }
 
 impl Updates {
-    pub fn of(releases: &Releases) -> Self {
+    pub fn for_releases(releases: &Releases) -> Self {
         let (releases, sets) = (releases.clone(), MemorySets::new());
         Self {
             releases,
@@ -337,7 +338,7 @@ impl Rig {
     }
     /// One with a stop line, if there is one.
     pub fn updatable_with(releases: &Releases, stop: StopDesk) -> Self {
-        let updates = Some(Updates::of(releases));
+        let updates = Some(Updates::for_releases(releases));
         Self::new(TestBody::at("A"), MemoryStore::new(), Bugs::default(), updates, START_MS, stop)
     }
     pub fn with(body: TestBody, store: MemoryStore, bugs: Bugs) -> Self {
@@ -350,7 +351,7 @@ impl Rig {
     /// One that stands at A, has a stop line and can change its software, with naive rules.
     pub fn naive(releases: &Releases, bugs: Bugs) -> Self {
         let stop = StopDesk { is_there: true, ..StopDesk::default() };
-        Self::new(TestBody::at("A"), MemoryStore::new(), bugs, Some(Updates::of(releases)), START_MS, stop)
+        Self::new(TestBody::at("A"), MemoryStore::new(), bugs, Some(Updates::for_releases(releases)), START_MS, stop)
     }
     fn new(body: TestBody, store: MemoryStore, bugs: Bugs, updates: Option<Updates>, ms: u64, stop: StopDesk) -> Self {
         let kept = store.load_now("ring-1");
@@ -381,7 +382,7 @@ impl Rig {
             generation: 100,
             heard: [0; 3],
         };
-        rig.put(Input::Start);
+        rig.give(Input::Start);
         rig
     }
     /// The process is killed and started again: what was not durable is gone.
@@ -394,7 +395,7 @@ impl Rig {
         next.epoch = self.epoch;
         next
     }
-    pub fn put(&mut self, input: Input) {
+    pub fn give(&mut self, input: Input) {
         let mut inputs = vec![input];
         while let Some(input) = inputs.pop() {
             let now = clocks_at(self.ms, self.updates.as_ref());
@@ -454,7 +455,7 @@ impl Rig {
         self.slow_disk = false;
         while let Some((batch, ops)) = self.unwritten.take() {
             self.store.commit_now(&ops);
-            self.put(Input::Persisted(batch));
+            self.give(Input::Persisted(batch));
         }
     }
     fn sent(&mut self, message: Uplink) {
@@ -484,11 +485,11 @@ impl Rig {
     }
     pub fn connect_as(&mut self, welcome: Welcome) {
         self.epoch = welcome.session_epoch;
-        self.put(Input::Connected(welcome));
+        self.give(Input::Connected(welcome));
         self.echo();
     }
     pub fn down(&mut self, down: Downlink) {
-        self.put(Input::Down(Box::new(down)));
+        self.give(Input::Down(Box::new(down)));
     }
     /// The server has processed the newest heartbeat.
     pub fn echo(&mut self) {
@@ -499,7 +500,7 @@ impl Rig {
     pub fn silence(&mut self, ms: u64) {
         for _ in 0..ms / 500 {
             self.ms += 500;
-            self.put(Input::Tick);
+            self.give(Input::Tick);
         }
     }
     /// Time passes; each heartbeat is answered.

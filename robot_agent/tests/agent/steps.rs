@@ -25,7 +25,7 @@ fn work_that_ends_at_once_again_and_again_makes_no_flood_of_heartbeats() {
     for n in 0..50 {
         rig.work(rig.desired(Some(rig.offer(&format!("T{n}"), 1, vec![], vec![]))));
         rig.ms += 20;
-        rig.put(Input::Tick);
+        rig.give(Input::Tick);
     }
     let ended = rig.states().iter().filter(|(s, _)| *s == WorkState::Succeeded).count();
     assert!(ended > 20, "{ended} ended");

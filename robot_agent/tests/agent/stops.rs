@@ -1,4 +1,5 @@
-//! Fleet stop: what a robot does about stops and about their silence, and what lets it go on. The link's server and the stop service are the test.
+//! Fleet stop: what a robot does about stops and about their silence, and what lets it go on. The link's server and the
+//! stop service are the test.
 
 use crate::rig::{Rig, StopDesk, action, goto, point};
 use midshift_agent::core::Input;
@@ -33,25 +34,25 @@ pub fn desk() -> StopDesk {
     StopDesk { is_there: true, ..StopDesk::default() }
 }
 
-pub fn hear(rig: &mut Rig, news: StopNews) {
-    rig.put(Input::Stop(Box::new(news)));
+pub fn hear_news(rig: &mut Rig, news: StopNews) {
+    rig.give(Input::Stop(Box::new(news)));
 }
 
 pub fn told(rig: &mut Rig, stops: Vec<Stop>, resets: Vec<Reset>) {
-    hear(rig, StopNews::Told { stops, resets, generation: SYNCED });
+    hear_news(rig, StopNews::Told { stops, resets, generation: SYNCED });
 }
 
 /// A line opens, and nothing is effective.
 pub fn attend(rig: &mut Rig) {
     let nonce = rig.ms * 1_000;
-    hear(rig, StopNews::Attended { nonce });
-    hear(rig, StopNews::Synced { generation: SYNCED, key: Vec::new() });
+    hear_news(rig, StopNews::Attended { nonce });
+    hear_news(rig, StopNews::Synced { generation: SYNCED, key: Vec::new() });
 }
 
 /// Every check-in that waits is answered.
 fn answer(rig: &mut Rig) {
     for (nonce, said) in std::mem::take(&mut rig.stop.check_ins) {
-        hear(rig, StopNews::CheckedIn { nonce, generation: said.generation });
+        hear_news(rig, StopNews::CheckedIn { nonce, generation: said.generation });
     }
 }
 
@@ -199,7 +200,7 @@ fn in_whatever_order_and_however_often_it_is_told_it_obeys_the_same() {
         |rig| told(rig, vec![stop(1, StopLevel::Halt)], vec![]),
         |rig| told(rig, vec![], vec![reset(1)]),
         |rig| told(rig, vec![stop(2, StopLevel::Halt)], vec![]),
-        |rig| hear(rig, StopNews::Synced { generation: SYNCED, key: Vec::new() }),
+        |rig| hear_news(rig, StopNews::Synced { generation: SYNCED, key: Vec::new() }),
     ];
     let mut orders = 0;
     for order in 0..256 {
@@ -374,7 +375,7 @@ fn a_robot_that_starts_stands_until_it_was_told_and_answered() {
     assert_eq!(level(&rig), StopLevel::Halt, "no line");
     rig.work(rig.desired(Some(to_c(&rig))));
     assert_eq!((rig.refusals(), moves(&rig)), (vec!["ROBOT_STOPPED".into()], false));
-    hear(&mut rig, StopNews::Attended { nonce: 5 });
+    hear_news(&mut rig, StopNews::Attended { nonce: 5 });
     serve(&mut rig, 5_000);
     assert_eq!(level(&rig), StopLevel::Halt, "answered, and not told");
     let mut rig = Rig::stoppable("A", desk());
@@ -429,13 +430,13 @@ fn answers_that_lay_in_a_buffer_feed_nothing() {
     assert!(late.len() >= 14 && !moves(&rig));
     let stood = level(&rig);
     for (nonce, _) in late {
-        hear(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED });
+        hear_news(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED });
     }
-    rig.put(Input::Tick);
+    rig.give(Input::Tick);
     assert_eq!((level(&rig), stood), (StopLevel::ControlledStopPosture, StopLevel::ControlledStopPosture));
     // Nor does the answer to a check-in of another.
     attend(&mut rig);
-    (0..9).for_each(|n| hear(&mut rig, StopNews::CheckedIn { nonce: n, generation: SYNCED }));
+    (0..9).for_each(|n| hear_news(&mut rig, StopNews::CheckedIn { nonce: n, generation: SYNCED }));
     assert_eq!(level(&rig), StopLevel::ControlledStopPosture);
     serve(&mut rig, 4_000);
     assert_eq!((level(&rig), awaiting(&rig).len()), (StopLevel::Halt, 1), "heard again, and a person resumes it");
@@ -447,7 +448,7 @@ fn an_answer_of_a_service_that_has_not_told_all_feeds_nothing_and_another_line_i
     for _ in 0..8 {
         rig.pass(500);
         for (nonce, _) in std::mem::take(&mut rig.stop.check_ins) {
-            hear(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED + 1 });
+            hear_news(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED + 1 });
         }
     }
     assert_eq!((rig.stop.redials.as_slice(), level(&rig)), (&["a stop was not told"][..], StopLevel::Slow));
@@ -469,7 +470,7 @@ fn twenty_seconds_without_the_service_slow_a_robot_where_nobody_walks_and_it_goe
     rig.silence(1_000);
     assert!(said(&rig).is_without_people);
     answer(&mut rig);
-    hear(&mut rig, StopNews::LineLost);
+    hear_news(&mut rig, StopNews::LineLost);
     stop_silence(&mut rig, 9_000);
     assert_eq!((level(&rig), speeds(&rig)), (StopLevel::None, vec![1_500, 1_500]));
     stop_silence(&mut rig, 11_000);
@@ -485,7 +486,7 @@ fn thirty_seconds_stand_it_there_too_and_it_still_goes_on_by_itself() {
     let mut rig = driving();
     rules(&mut rig, true);
     serve(&mut rig, 1_000);
-    hear(&mut rig, StopNews::LineLost);
+    hear_news(&mut rig, StopNews::LineLost);
     stop_silence(&mut rig, 31_000);
     assert_eq!((level(&rig), moves(&rig)), (StopLevel::ControlledStopPosture, false));
     attend(&mut rig);
@@ -498,7 +499,7 @@ fn the_same_twenty_seconds_stand_it_among_people_and_a_person_resumes_it() {
     let mut rig = driving();
     rules(&mut rig, false);
     serve(&mut rig, 1_000);
-    hear(&mut rig, StopNews::LineLost);
+    hear_news(&mut rig, StopNews::LineLost);
     stop_silence(&mut rig, 20_000);
     assert_eq!((level(&rig), moves(&rig)), (StopLevel::ControlledStopPosture, false));
     attend(&mut rig);
@@ -524,7 +525,7 @@ fn a_robot_that_does_not_know_where_it_is_counts_as_among_people() {
 #[test]
 fn a_restart_of_the_links_server_never_moves_the_ladder() {
     let mut rig = driving();
-    rig.put(Input::Disconnected);
+    rig.give(Input::Disconnected);
     for _ in 0..40 {
         rig.silence(500);
         answer(&mut rig);
@@ -623,7 +624,7 @@ fn a_robot_that_drives_into_a_stopped_part_stands_at_its_border() {
         rig.ms += step.max(1);
         x_mm += 150 * step as i32 / 100;
         stand_at(&rig, x_mm);
-        rig.put(Input::Tick);
+        rig.give(Input::Tick);
         answer(&mut rig);
     }
     assert!((2_500..2_700).contains(&x_mm), "it stands {x_mm} mm from where it set out");
@@ -667,7 +668,9 @@ fn a_line_says_once_a_second_what_is_so_and_at_once_what_has_changed() {
     for _ in 0..20 {
         rig.silence(500);
         let waiting = rig.stop.check_ins.last().cloned();
-        waiting.into_iter().for_each(|(nonce, _)| hear(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED }));
+        waiting
+            .into_iter()
+            .for_each(|(nonce, _)| hear_news(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED }));
     }
     assert_eq!(rig.stop.check_ins.len(), 10);
     let nonces: BTreeSet<u64> = rig.stop.check_ins.iter().map(|(nonce, _)| *nonce).collect();

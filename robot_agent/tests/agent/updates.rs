@@ -1,4 +1,5 @@
-//! What a robot does with its software: take it, stage it, run it on trial, keep it or go back; and what it does not take.
+//! What a robot does with its software: take it, stage it, run it on trial, keep it or go back; and what it does not
+//! take.
 
 use crate::bases::{a_day_passes, migrations};
 use crate::release::{Bundle, Releases};
@@ -486,19 +487,25 @@ fn an_order_for_the_set_that_runs_already_is_answered_and_changes_nothing() {
     }
 }
 
+/// With `second` on trial, and stuck with it: the kept set, `first`, has rotted. With its name, and what rots it: the second time its
+/// byte is as it was.
+pub fn stuck(rig: Rig, releases: &Releases, first: &Bundle, second: &Bundle) -> (Rig, String, impl Fn() + use<>) {
+    let rig = committed(rig, releases, first, 1);
+    let kept = name_of(&rig);
+    let (mut rig, mut order) = on_trial(rig, releases, second, 2);
+    let (sets, digest) = (rig.updates.as_ref().expect("has them").sets.clone(), first.manifest.components[0].digest);
+    let rot = move || sets.rot(&digest);
+    rot();
+    want(&mut rig, order.to(Goal::Revert));
+    assert_eq!(state(&rig), Some(UpdateState::Stuck));
+    (rig, kept, rot)
+}
+
 #[test]
 fn a_stuck_robot_goes_back_by_a_newer_order_once_its_kept_set_is_whole_again() {
     let (rig, releases) = connected();
     let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
-    let rig = committed(rig, &releases, &first, 1);
-    let kept = name_of(&rig);
-    let (mut rig, mut order) = on_trial(rig, &releases, &second, 2);
-    let sets = rig.updates.as_ref().expect("has them").sets.clone();
-    // The second time its byte is as it was.
-    let rot = || sets.rot(&first.manifest.components[0].digest);
-    rot();
-    want(&mut rig, order.to(Goal::Revert));
-    assert_eq!(state(&rig), Some(UpdateState::Stuck));
+    let (mut rig, kept, rot) = stuck(rig, &releases, &first, &second);
     let order_back = |rig: &mut Rig, generation: u64| {
         let mut order = Order::new(releases.directive(&second, generation));
         order.generation = generation * 100_000;
@@ -730,7 +737,7 @@ fn what_was_asked_of_the_disk_is_on_the_ledger_first() {
     grant(&mut rig, &mut order, 5_000);
     assert_eq!((switch(&rig), rig.exit), (Switch::default(), None), "SWITCHING is not durable");
     rig.flush();
-    rig.put(Input::Tick);
+    rig.give(Input::Tick);
     assert_eq!(rig.exit, Some(ExitReason::Switched));
     assert!(switch(&rig).trial.is_some());
 }
@@ -754,9 +761,9 @@ fn a_switch_that_waits_for_the_disk_is_not_made_once_its_grant_has_ended_or_some
         rig.slow_disk = true;
         grant(&mut rig, &mut order, 5_000);
         change(&mut rig);
-        rig.put(Input::Tick);
+        rig.give(Input::Tick);
         rig.flush();
-        rig.put(Input::Tick);
+        rig.give(Input::Tick);
         if by.is_empty() {
             assert_eq!(rig.exit, Some(ExitReason::Switched), "nothing came between");
             continue;

@@ -164,7 +164,7 @@ async fn one_agent(args: AgentRun, hand: Hand, stop: CancellationToken) -> anyho
     hand(&handle, &clock);
     let _person =
         args.person.then(|| AbortOnDropHandle::new(tokio::spawn(visit(handle.clone(), args.seed, clock.clone()))));
-    let mut pulse = midshift_agent::pulse::for_launcher();
+    let mut pulse = midshift_agent::launcher_heartbeat::for_launcher();
     if let Some(software) = &software {
         pulse = software.pulse(pulse, &clock);
     }
