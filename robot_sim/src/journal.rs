@@ -2,7 +2,7 @@
 //! happened.
 //!
 //! Invariant: an entry is written by the body that did it, with one write call, and never changed; a killed process
-//! leaves all it has written. It is what runs are judged by ([`crate::oracle`]).
+//! leaves all it has written. It is what runs are judged by ([`crate::judge`]).
 
 use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
 use midshift_core::robot::StopLevel;

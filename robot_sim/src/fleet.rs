@@ -1,4 +1,4 @@
-//! All simulated robots of one process in their hall: who stands where at the start, who can be laid hands on, what
+//! The fleet of simulated robots of one process: who stands where at the start, who can be laid hands on, what
 //! came of it.
 //!
 //! Invariant: with everything in memory all bodies share one world and one journal; in a directory each body has its
@@ -8,7 +8,7 @@ use crate::body::{self, BodyConfig, Counts, JOURNAL_FILE, SimBody};
 use crate::faults::{FaultRates, Injected};
 use crate::handle::SimHandle;
 use crate::journal;
-use crate::oracle::{Oracle, Verdict};
+use crate::judge::{Judge, Verdict};
 use crate::person::{Deed, Person};
 use crate::world::{SharedWorld, World, WorldConfig, lock};
 use midshift_core::ids::{RobotId, TaskId, WaypointId};
@@ -21,7 +21,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Why a hall could not be opened or judged.
+/// Why a fleet could not be opened or judged.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// More robots than seats.
@@ -59,9 +59,9 @@ pub enum Persistence {
     Dir(PathBuf),
 }
 
-/// What hall.
+/// What fleet.
 #[derive(Clone, Debug)]
-pub struct HallConfig {
+pub struct FleetConfig {
     /// The site.
     pub site: Arc<Site>,
     /// Robots of the whole site: decides who starts where.
@@ -88,8 +88,8 @@ pub struct HallConfig {
     pub pace_permille: u32,
 }
 
-impl HallConfig {
-    /// A hall for `dev`: all in memory, shelves that never run out, default faults, `rbt-01`, `rbt-02`, …
+impl FleetConfig {
+    /// A fleet for `dev`: all in memory, shelves that never run out, default faults, `rbt-01`, `rbt-02`, …
     pub fn new(site: Arc<Site>, count: usize, seed: u64) -> Self {
         Self {
             site,
@@ -136,9 +136,9 @@ impl HallConfig {
     }
 }
 
-/// What a hall reports at the end of a run.
+/// What a fleet reports at the end of a run.
 #[derive(Clone, Debug, serde::Serialize)]
-pub struct HallReport {
+pub struct FleetReport {
     /// How many robots it had.
     pub robots: usize,
     /// What the journals say.
@@ -159,9 +159,9 @@ pub struct HallReport {
     pub journal_entries_lost: u64,
 }
 
-/// The hall.
+/// The fleet.
 #[derive(Debug)]
-pub struct Hall {
+pub struct Fleet {
     site: Arc<Site>,
     robots: Vec<SimHandle>,
     worlds: Vec<SharedWorld>,
@@ -170,9 +170,9 @@ pub struct Hall {
     person: Mutex<Person>,
 }
 
-impl Hall {
+impl Fleet {
     /// Makes or brings back every body that lives here.
-    pub fn open(config: &HallConfig, now: &Now) -> Result<Self, Error> {
+    pub fn open(config: &FleetConfig, now: &Now) -> Result<Self, Error> {
         let starts = config.starting_waypoints()?;
         let part = config.only.clone().unwrap_or(0..config.count);
         let world = |tag: &str| WorldConfig {
@@ -182,7 +182,7 @@ impl Hall {
             crowded: config.crowded,
         };
         let shared = World::new(world(""), &config.site).shared();
-        let mut hall = Self {
+        let mut fleet = Self {
             site: config.site.clone(),
             robots: Vec::new(),
             worlds: Vec::new(),
@@ -202,17 +202,17 @@ impl Hall {
                     let dir = dir.join(robot_id.as_str());
                     let own = world(robot_id.as_str());
                     let (body, world) = SimBody::restore(of_body, config.site.clone(), own, &dir, now.site)?;
-                    hall.worlds.push(world);
-                    hall.journals.push(dir.join(JOURNAL_FILE));
+                    fleet.worlds.push(world);
+                    fleet.journals.push(dir.join(JOURNAL_FILE));
                     body
                 }
             };
-            hall.robots.push(SimHandle::new(body));
+            fleet.robots.push(SimHandle::new(body));
         }
         if config.persistence == Persistence::Memory {
-            hall.worlds.push(shared);
+            fleet.worlds.push(shared);
         }
-        Ok(hall)
+        Ok(fleet)
     }
     /// The site.
     pub fn site(&self) -> &Arc<Site> {
@@ -243,25 +243,25 @@ impl Hall {
     pub fn journals(&self) -> &[PathBuf] {
         &self.journals
     }
-    /// What these journals of other processes say together with those of this hall, which must have its own in files.
+    /// What these journals of other processes say together with those of this fleet, which must have its own in files.
     ///
     /// # Errors
     /// A journal that cannot be read.
     pub fn verdict_with(&self, others: &[PathBuf]) -> Result<Verdict, Error> {
         let all = self.journals.iter().chain(others).map(PathBuf::as_path);
-        Ok(Oracle::read(&self.site, all)?.verdict())
+        Ok(Judge::read(&self.site, all)?.verdict())
     }
     /// What the journals say now. Several journals are read from their files.
     pub fn verdict(&self) -> Result<Verdict, Error> {
         match &self.worlds[..] {
-            [world] => Ok(lock(world).oracle().verdict()),
+            [world] => Ok(lock(world).judge().verdict()),
             _ if self.crowded => Ok(Verdict::default()),
-            _ => Ok(Oracle::read(&self.site, self.journals.iter().map(PathBuf::as_path))?.verdict()),
+            _ => Ok(Judge::read(&self.site, self.journals.iter().map(PathBuf::as_path))?.verdict()),
         }
     }
     /// All that can be said of the bodies at `now`.
-    pub fn report(&self, now: SiteTime) -> Result<HallReport, Error> {
-        let mut report = HallReport {
+    pub fn report(&self, now: SiteTime) -> Result<FleetReport, Error> {
+        let mut report = FleetReport {
             robots: self.robots.len(),
             verdict: Verdict::default(),
             collisions_modelled: self.site.collisions_modelled(),

@@ -77,7 +77,7 @@ struct Room {
 
 /// The judge. Entries of one journal must come in their order; journals of different worlds in any.
 #[derive(Clone, Debug, Default)]
-pub struct Oracle {
+pub struct Judge {
     rooms: BTreeMap<PlaceId, Room>,
     items: BTreeMap<String, Spot>,
     hands: BTreeSet<RobotId>,
@@ -91,7 +91,7 @@ pub struct Oracle {
     entries: u64,
 }
 
-impl Oracle {
+impl Judge {
     /// For a site whose places have these capacities. Places not named are not judged.
     pub fn new(capacities: impl IntoIterator<Item = (PlaceId, u32)>) -> Self {
         let room = |capacity| Room { capacity, stays: Vec::new(), violations: BTreeMap::new(), words: Vec::new() };
@@ -104,18 +104,18 @@ impl Oracle {
     }
     /// Judges the journals of several bodies together: each file in its order, places by the times in the entries.
     pub fn read<'a>(site: &Site, journals: impl IntoIterator<Item = &'a Path>) -> Result<Self, journal::Error> {
-        let mut oracle = Self::of_site(site);
+        let mut judge = Self::of_site(site);
         for path in journals {
-            journal::read(path)?.iter().for_each(|entry| oracle.take(entry));
+            journal::read(path)?.iter().for_each(|entry| judge.judge_entry(entry));
         }
-        Ok(oracle)
+        Ok(judge)
     }
     /// Entries taken so far.
     pub fn entries(&self) -> u64 {
         self.entries
     }
     /// Takes one entry.
-    pub fn take(&mut self, entry: &Entry) {
+    pub fn judge_entry(&mut self, entry: &Entry) {
         self.entries += 1;
         let robot_id = entry.robot_id.as_ref();
         match (&entry.effect, robot_id) {
@@ -187,14 +187,14 @@ impl Oracle {
         drops
     }
 
-    fn say(&mut self, text: String) {
+    fn note_finding(&mut self, text: String) {
         if self.words.len() < WORDS_MAX {
             self.words.push(text);
         }
     }
     fn broke(&mut self, entry: &Entry, how: &str) {
         self.broken += 1;
-        self.say(format!("{how}: {entry:?}"));
+        self.note_finding(format!("{how}: {entry:?}"));
     }
     fn carry(&mut self, entry: &Entry, item: &str, from: &Spot, to: Spot) {
         let full_handed = match &to {
@@ -218,7 +218,7 @@ impl Oracle {
         *times += 1;
         if *times > 1 {
             self.twice += 1;
-            self.say(format!("step done twice: {entry:?}"));
+            self.note_finding(format!("step done twice: {entry:?}"));
         } else {
             self.done_order.push_back(key);
         }
