@@ -110,7 +110,7 @@ pub struct AgentCore {
 }
 
 impl AgentCore {
-    /// A robot that remembers `kept`. Call with [`Input::Start`] first.
+    /// A robot that remembers `kept`. Call with [`super::Input::Start`] first.
     pub fn new(config: CoreConfig, body: Box<dyn Body>, kept: Kept, now: Now) -> Self {
         let bugs = config.bugs;
         let (places, restored) = Places::restored(kept.ledger.places.clone(), bugs.grant_from_receipt());

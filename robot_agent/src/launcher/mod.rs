@@ -115,7 +115,8 @@ fn keep_running(orders: &Orders) -> io::Result<()> {
         let before = std::mem::replace(&mut tries, start.tries.clone());
         keep_tries(&orders.record, &tries);
         beacon.begins(&start, now_unix_s());
-        let ending = run_once(orders, &start, &mut tries, &mut environment, &mut beacon)?;
+        let run = Run { orders, start: &start, tries: &mut tries, environment: &mut environment, beacon: &mut beacon };
+        let ending = run_once(run)?;
         if !matches!(ending, Ending::Environment(_)) {
             environment.passed();
         }
@@ -163,14 +164,18 @@ fn next_try(start: &Start, tries: &Tries, how: &str) -> Duration {
     pause
 }
 
+/// One run of the program, and what is noted of it.
+struct Run<'a> {
+    orders: &'a Orders,
+    start: &'a Start,
+    tries: &'a mut Tries,
+    environment: &'a mut Environment,
+    beacon: &'a mut Beacon,
+}
+
 /// Runs the program until it ends or hangs.
-fn run_once(
-    orders: &Orders,
-    start: &Start,
-    tries: &mut Tries,
-    environment: &mut Environment,
-    beacon: &mut Beacon,
-) -> io::Result<Ending> {
+fn run_once(run: Run<'_>) -> io::Result<Ending> {
+    let (orders, start) = (run.orders, run.start);
     let started = Command::new(&start.program)
         .args(&orders.arguments)
         .env(PULSE_ASKED, "1")
@@ -200,7 +205,7 @@ fn run_once(
         // The other end is gone only if the program was already given up.
         let _ = signs.send(Sign::Ended);
     });
-    let ending = watch(&mut child.0, &heard, orders, start, tries, environment, beacon)?;
+    let ending = watch(&mut child.0, &heard, run)?;
     drop(heard);
     drop(child);
     // A grandchild may keep the pipe open; it is not waited for.
@@ -208,15 +213,8 @@ fn run_once(
     Ok(ending)
 }
 
-fn watch(
-    child: &mut Child,
-    heard: &Receiver<Sign>,
-    orders: &Orders,
-    start: &Start,
-    tries: &mut Tries,
-    environment: &mut Environment,
-    beacon: &mut Beacon,
-) -> io::Result<Ending> {
+fn watch(child: &mut Child, heard: &Receiver<Sign>, run: Run<'_>) -> io::Result<Ending> {
+    let Run { orders, start, tries, environment, beacon } = run;
     let mut pulses = 0;
     let mut sign_by = Instant::now() + orders.hang;
     loop {

@@ -127,7 +127,9 @@ fn a_program_without_a_pulse_is_killed() {
     orders.hang = Duration::from_secs(1);
     let start = chosen(&orders);
     let (mut tries, mut environment, mut beacon) = (start.tries.clone(), Environment::default(), Beacon::new(&orders));
-    let ending = run_once(&orders, &start, &mut tries, &mut environment, &mut beacon).expect("runs");
+    let run =
+        Run { orders: &orders, start: &start, tries: &mut tries, environment: &mut environment, beacon: &mut beacon };
+    let ending = run_once(run).expect("runs");
     assert_eq!(ending, Ending::Hung);
 }
 

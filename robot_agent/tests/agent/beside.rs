@@ -5,8 +5,8 @@
 //! to its rate, fill the window of everything else.
 
 use crate::remote::Shop;
-use crate::rig::TestBody;
 use crate::session::{Desk, Pipes, Seen, clock, config};
+use crate::test_body::TestBody;
 use async_trait::async_trait;
 use midshift_agent::body::BodyNews;
 use midshift_agent::bulk::Bulk;

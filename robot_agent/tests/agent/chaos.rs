@@ -1,7 +1,8 @@
 //! A robot among lost messages, kills, slow disks and careless orders: what must hold after each step, whatever came
 //! before.
 
-use crate::rig::{Rig, TestBody, action, goto, place_id, point};
+use crate::rig::{Rig, action, goto, place_id, point};
+use crate::test_body::TestBody;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_agent::core::Input;
 use midshift_agent::memory::MemoryStore;

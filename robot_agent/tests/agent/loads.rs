@@ -1,6 +1,7 @@
 //! A load that its body cannot feel, and a person's word that it is not there.
 
-use crate::rig::{Rig, TestBody};
+use crate::rig::Rig;
+use crate::test_body::TestBody;
 use midshift_agent::body::BodyNews;
 use midshift_agent::bugs::Bugs;
 use midshift_agent::memory::MemoryStore;

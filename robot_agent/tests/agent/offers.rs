@@ -1,6 +1,7 @@
 //! Offers: what a robot takes, what it refuses and what it remembers.
 
-use crate::rig::{Rig, TestBody, action, attempt, goto, point, welcome};
+use crate::rig::{Rig, action, attempt, goto, point, welcome};
+use crate::test_body::TestBody;
 use midshift_agent::body::BodyNews;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_agent::core::{ExitReason, Input};

@@ -1,7 +1,8 @@
 //! The shell against a server that the test plays, over pipes in memory and on tokio's paused clock.
 
 use crate::release::{Releases, component};
-use crate::rig::{TestBody, attempt, goto, point, waypoint, welcome};
+use crate::rig::{attempt, desired, goto, point, waypoint, welcome};
+use crate::test_body::TestBody;
 use async_trait::async_trait;
 use hyper_util::rt::TokioIo;
 use midshift_agent::body::BodyNews;
@@ -411,18 +412,7 @@ async fn a_robot_on_its_file_takes_work_over_the_wire_and_does_it() {
         suspend: false,
         speed_limit_mm_s: None,
     };
-    let work = DesiredWork {
-        robot_id: RobotId::parse("rbt-01").expect("a name"),
-        generation: 1,
-        assignment: Some(assignment),
-        grants: Vec::new(),
-        held: false,
-        resume: None,
-        closed: Vec::new(),
-        maintenance: None,
-        resumed: Vec::new(),
-        load_word: None,
-    };
+    let work = DesiredWork { generation: 1, ..desired(Some(assignment)) };
     session.send(ToRobot::Downlink(Box::new(Downlink { work: Some(work), ..Downlink::default() }))).await;
     let mut states = Vec::new();
     while states.last() != Some(&WorkState::Succeeded) {

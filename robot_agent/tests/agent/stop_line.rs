@@ -1,9 +1,9 @@
 //! The line to the stop service, over pipes in memory and tokio's paused clock, and over loopback; and the file of
 //! stops.
 
-use crate::rig::TestBody;
 use crate::session::{Pipes, clock, config};
 use crate::stops::{reset, stop, stop_id};
+use crate::test_body::TestBody;
 use async_trait::async_trait;
 use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;

@@ -1,8 +1,48 @@
 //! A robot that could not go back, and gets another order since.
 
-use crate::updates::{Order, connected, refused, relaunch, stage, state, stuck, switch, want};
+use crate::release::{Bundle, Releases};
+use crate::rig::Rig;
+use crate::updates::{
+    Order, committed, connected, name_of, on_trial, refused, relaunch, report, stage, state, switch, want,
+};
 use midshift_core::reason::Code;
 use midshift_core::update::{Goal, UpdateState};
+
+/// With `second` on trial, and stuck with it: the kept set, `first`, has rotted. With its name, and what rots it: the
+/// second time its byte is as it was.
+pub fn stuck(rig: Rig, releases: &Releases, first: &Bundle, second: &Bundle) -> (Rig, String, impl Fn() + use<>) {
+    let rig = committed(rig, releases, first, 1);
+    let kept = name_of(&rig);
+    let (mut rig, mut order) = on_trial(rig, releases, second, 2);
+    let (sets, digest) = (rig.updates.as_ref().expect("has them").sets.clone(), first.manifest.components[0].digest);
+    let rot = move || sets.rot(&digest);
+    rot();
+    want(&mut rig, order.to(Goal::Revert));
+    assert_eq!(state(&rig), Some(UpdateState::Stuck));
+    (rig, kept, rot)
+}
+
+#[test]
+fn a_stuck_robot_goes_back_by_a_newer_order_once_its_kept_set_is_whole_again() {
+    let (rig, releases) = connected();
+    let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
+    let (mut rig, kept, rot) = stuck(rig, &releases, &first, &second);
+    let order_back = |rig: &mut Rig, generation: u64| {
+        let mut order = Order::new(releases.directive(&second, generation));
+        order.generation = generation * 100_000;
+        want(rig, order.to(Goal::Revert));
+    };
+    order_back(&mut rig, 3);
+    let told = report(&rig).map(|told| (told.state, told.directive));
+    assert_eq!((told, rig.exit), (Some((UpdateState::Stuck, 3)), None), "it looked, and nothing was mended");
+    rot();
+    rig.pass(5_000);
+    assert_eq!(state(&rig), Some(UpdateState::Stuck), "nobody has said so");
+    order_back(&mut rig, 4);
+    let mut rig = relaunch(rig);
+    rig.pass(1_000);
+    assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), kept.as_str()));
+}
 
 #[test]
 fn a_stuck_robot_that_gets_a_newer_bundle_reads_its_kept_set_before_it_goes_back_to_it() {

@@ -2,8 +2,9 @@
 //! it is a number.
 
 use crate::release::{Releases, SIGNED};
-use crate::rig::{Rig, TestBody};
+use crate::rig::Rig;
 use crate::session::{Desk, Seen, clock, config};
+use crate::test_body::TestBody;
 use crate::trusts::Metadata;
 use midshift_agent::bulk::Bulk;
 use midshift_agent::dial::TcpDial;

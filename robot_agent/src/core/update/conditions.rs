@@ -46,7 +46,8 @@ impl AgentCore {
     pub(super) fn holds(&self, case: Case<'_>, condition: Condition) -> bool {
         let Case { now, update, holdings } = case;
         let switch = &holdings.switch;
-        let name = update.set_name();
+        // Its name is a digest, which is not made for nothing.
+        let name = || update.set_name();
         let on_trial = switch.trial.as_ref().map(|trial| &trial.set);
         match condition {
             Condition::Unlisted => self.update.listed.is_none(),
@@ -61,7 +62,7 @@ impl AgentCore {
             Condition::ActivationBlocked => self.blocks_activation(now).is_some(),
             Condition::GrantStale => self.unused_grant().is_some_and(|g| self.is_valid(now, &g.authority).is_err()),
             Condition::Granted => self.unused_grant().is_some(),
-            Condition::SetRuns => name.is_some_and(|name| switch.running() == name),
+            Condition::SetRuns => name().is_some_and(|name| switch.running() == name),
             Condition::SwitchBlocked => self.may_switch(now, update).is_err(),
             Condition::SelfTestFailed => self.self_test().is_err(),
             Condition::WantedBack => self.wants_back(update),
@@ -76,8 +77,8 @@ impl AgentCore {
                 let desired = self.update.desired.as_ref();
                 desired.is_some_and(|d| d.goal == Goal::Commit && self.is_the_newest(d))
             }
-            Condition::OnTrialInRecord => on_trial.is_some() && on_trial == name.as_ref(),
-            Condition::RecordNamesAnother => on_trial.is_some() || Some(&switch.current) != name.as_ref(),
+            Condition::OnTrialInRecord => on_trial.is_some() && on_trial == name().as_ref(),
+            Condition::RecordNamesAnother => on_trial.is_some() || Some(&switch.current) != name().as_ref(),
             Condition::WentBack => case.runs_another() && self.update.went_back,
             Condition::KeptSetUnfit => case.runs_another() && self.self_test().is_err(),
             Condition::KeptSetRuns => case.runs_another(),
