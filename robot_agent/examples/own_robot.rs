@@ -1,5 +1,6 @@
-//! A robot of one's own: a point that drives, picks and places. Beside `cargo run --release -- dev --robots 6` start it by
-//! `cargo run --release -p midshift-agent --example own_robot -- --robot-id own-1 --data own-1 --stop-server 127.0.0.1:7421`
+//! A robot of one's own: a point that drives, picks and places. Beside `cargo run --release -- dev --robots 6` start it
+//! by `cargo run --release -p midshift-agent --example own_robot -- --robot-id own-1 --data own-1 --stop-server
+//! 127.0.0.1:7421`
 use midshift_agent::body::{Body, BodyLimits, BodyNews, BodyOrder, BodyState, Fault, Inventory, Load, Pose};
 use midshift_agent::body::{SiteDuration, SiteTime, StepKind, StopLevel, TaskId, WaypointId};
 

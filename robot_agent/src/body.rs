@@ -1,8 +1,9 @@
 //! What a machine must offer so that the agent can drive it: the whole of `trait Body`, for makers to implement.
 //!
-//! A vendor SDK, a ROS 2 node or a simulator stands behind it; `examples/own_robot.rs` is one in 60 lines, docs/make-a-robot.md leads there.
-//! Every call returns at once. The agent polls; a body never calls back, never blocks and never reads a clock of its own:
-//! `now` is the site clock. Invariant: the agent never asks for more than `limits` allow, and a body may always do less.
+//! A vendor SDK, a ROS 2 node or a simulator stands behind it; `examples/own_robot.rs` is one in 60 lines,
+//! docs/make-a-robot.md leads there. Every call returns at once. The agent polls; a body never calls back, never blocks
+//! and never reads a clock of its own: `now` is the site clock. Invariant: the agent never asks for more than `limits`
+//! allow, and a body may always do less.
 
 pub use midshift_core::ids::{TaskId, WaypointId};
 pub use midshift_core::robot::{Fault, HardwareStop, Inventory, Load, Mode, Pose, StopLevel};
@@ -31,13 +32,14 @@ pub struct PathPoint {
     pub y_mm: i32,
     /// Speed on the way to this point, millimetres per second: already the lowest of all layers.
     pub speed_mm_s: u32,
-    /// Distance to keep from people and things on the way to this point, millimetres. None: the body's own. A body that cannot
-    /// measure distances drives as it does.
+    /// Distance to keep from people and things on the way to this point, millimetres. None: the body's own. A body that
+    /// cannot measure distances drives as it does.
     pub keep_off_mm: Option<u32>,
 }
 
 impl PathPoint {
-    /// Moves `pose` straight to this point for so long, no faster than asked; true: it is there. For bodies that are only pretended.
+    /// Moves `pose` straight to this point for so long, no faster than asked; true: it is there. For bodies that are
+    /// only pretended.
     pub fn approach(&self, pose: &mut Pose, duration: SiteDuration) -> bool {
         let (dx, dy) = (f64::from(self.x_mm - pose.x_mm), f64::from(self.y_mm - pose.y_mm));
         let (left_mm, may_mm) = (dx.hypot(dy), f64::from(self.speed_mm_s) * duration.as_ms() as f64 / 1_000.0);
@@ -120,8 +122,9 @@ pub trait Body: Send {
     fn capabilities(&self) -> Inventory;
     /// What the maker allows.
     fn limits(&self) -> BodyLimits;
-    /// Whose work the orders after this call are: the task and the index of its step; none for an errand or none. Said before
-    /// [`Body::start`], so that the body's own records and its [`Load`] can name the task. A body that keeps no records ignores it.
+    /// Whose work the orders after this call are: the task and the index of its step; none for an errand or none. Said
+    /// before [`Body::start`], so that the body's own records and its [`Load`] can name the task. A body that keeps no
+    /// records ignores it.
     fn work_for(&mut self, _task_id: Option<&TaskId>, _step_index: u32) {}
     /// Begins an order. An error is a fault that was clear at once (unknown action); the body stands.
     fn start(&mut self, now: SiteTime, order: BodyOrder) -> Result<(), Fault>;
@@ -131,8 +134,9 @@ pub trait Body: Send {
     fn resume(&mut self, now: SiteTime);
     /// Brings it to this level of operational stop and drops its order, except for [`StopLevel::Slow`].
     fn stop(&mut self, now: SiteTime, level: StopLevel);
-    /// The level of operational stop that the robot obeys from now on; told whenever it changes. What follows of it for its orders the agent says by
-    /// [`Body::pause`], [`Body::stop`] and the speeds of its path; a body that has more to slow down or to show does that here.
+    /// The level of operational stop that the robot obeys from now on; told whenever it changes. What follows of it for
+    /// its orders the agent says by [`Body::pause`], [`Body::stop`] and the speeds of its path; a body that has more to
+    /// slow down or to show does that here.
     fn obeys(&mut self, _now: SiteTime, _level: StopLevel) {}
     /// It stands and will not move by itself. By default: nothing will change.
     fn standstill(&self, now: SiteTime) -> bool {
@@ -140,7 +144,8 @@ pub trait Body: Send {
     }
     /// Takes the posture in which it may stand for long. A body that may always stand as it stands does nothing.
     fn park(&mut self, _now: SiteTime) {}
-    /// Starts or stops charging; only called while it stands at a charger. A body that charges by itself there does nothing.
+    /// Starts or stops charging; only called while it stands at a charger. A body that charges by itself there does
+    /// nothing.
     fn charge(&mut self, _now: SiteTime, _on: bool) {}
     /// What happened since the last call, in order. Called after every other call and at `next_change`.
     fn poll(&mut self, now: SiteTime) -> Vec<BodyNews>;
@@ -150,15 +155,18 @@ pub trait Body: Send {
     fn state(&self, now: SiteTime) -> BodyState;
     /// What it carries.
     fn load(&self) -> Option<Load>;
-    /// A person has looked: it carries nothing. Asked only of a body whose [`Inventory`] says that it knows its load by memory alone. From
-    /// then on [`Body::load`] is none, and its next news says so. A body that feels what it carries ignores it.
+    /// A person has looked: it carries nothing. Asked only of a body whose [`Inventory`] says that it knows its load by
+    /// memory alone. From then on [`Body::load`] is none, and its next news says so. A body that feels what it carries
+    /// ignores it.
     fn forget_load(&mut self, _now: SiteTime) {}
-    /// Whether a step that may have been under way at a restart was done. `task_id` names whose step it was. A body that cannot tell leaves it to people.
+    /// Whether a step that may have been under way at a restart was done. `task_id` names whose step it was. A body
+    /// that cannot tell leaves it to people.
     fn check(&self, _step: &StepKind, _task_id: Option<&TaskId>) -> Checked {
         Checked::Unknown
     }
-    /// The maker's own test, asked for once when the agent starts and the body stands; an error says what is broken. Until the body says
-    /// that this fault is over ([`BodyNews::Fault`]) the robot accepts no work. A body without a test has nothing to say.
+    /// The maker's own test, asked for once when the agent starts and the body stands; an error says what is broken.
+    /// Until the body says that this fault is over ([`BodyNews::Fault`]) the robot accepts no work. A body without a
+    /// test has nothing to say.
     fn self_test(&mut self, _now: SiteTime) -> Result<(), Fault> {
         Ok(())
     }

@@ -1,5 +1,5 @@
-//! The clocks of a real process: tokio's monotonic clock, so that a simulation can own it, and the wall's UTC, read whenever the time is
-//! asked for.
+//! The clocks of a real process: tokio's monotonic clock, so that a simulation can own it, and the wall's UTC, read
+//! whenever the time is asked for.
 //!
 //! Called by programs, at their start: by [`crate::program`], and by the binary for its servers.
 
@@ -10,8 +10,8 @@ use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 use tokio::time::Instant;
 
-/// systemd touches it when the clock of the machine was set from the network. The kernel is not asked: the system call filter of our own
-/// unit ends a process that calls adjtimex, also one that only reads.
+/// systemd touches it when the clock of the machine was set from the network. The kernel is not asked: the system call
+/// filter of our own unit ends a process that calls adjtimex, also one that only reads.
 const SYNCED: &str = "/run/systemd/timesync/synchronized";
 
 /// UTC of the machine, unix ms.

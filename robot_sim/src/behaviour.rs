@@ -1,9 +1,9 @@
 //! What a release of robot software makes a simulated robot do: `behaviour.toml`, a component of its set.
 //!
-//! A new version changes what the robot really does, so that a roll-out has something true to see: good releases, ones that wear, and ones
-//! that crash, hang, or go wrong only under load.
-//! Invariant: it never drives faster than it is asked to. Speed, faults, energy and heat are the body's ([`crate::body`]); crash and hang
-//! are the program's that runs it.
+//! A new version changes what the robot really does, so that a roll-out has something true to see: good releases, ones
+//! that wear, and ones that crash, hang, or go wrong only under load. Invariant: it never drives faster than it is
+//! asked to. Speed, faults, energy and heat are the body's ([`crate::body`]); crash and hang are the program's that
+//! runs it.
 
 use crate::faults::FaultRates;
 use midshift_core::reason::{Refusal, Violations};

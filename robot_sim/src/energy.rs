@@ -1,6 +1,7 @@
 //! What work costs a body: its battery and the heat of its joints, in closed form over a stretch of constant work.
 //!
-//! The figures are those of [`midshift_core::energy`], by which work is given. Called by [`crate::body`]. Invariant: without energy flowing in, the charge never rises.
+//! The figures are those of [`midshift_core::energy`], by which work is given. Called by [`crate::body`]. Invariant:
+//! without energy flowing in, the charge never rises.
 
 use midshift_core::energy::{ACT_W, CAPACITY_MWH, DRIVE_MWH_PER_M, IDLE_W, LOADED_FACTOR};
 use midshift_core::time::SiteDuration;

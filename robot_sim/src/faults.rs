@@ -53,8 +53,8 @@ impl FaultRates {
             manual_per_hour: 0.0,
         }
     }
-    /// Of a body that works `pace` times as fast as real by a real clock: what comes with its work goes wrong as often in a minute as at its
-    /// own pace. What comes with time does anyway.
+    /// Of a body that works `pace` times as fast as real by a real clock: what comes with its work goes wrong as often
+    /// in a minute as at its own pace. What comes with time does anyway.
     #[must_use]
     pub fn paced(&self, pace: f64) -> Self {
         let Self { silence_per_hour, manual_per_hour, .. } = *self;
@@ -100,31 +100,31 @@ fn fault(code: u32, class: FaultClass, message: &str) -> Fault {
     Fault { code, class, message: message.to_owned() }
 }
 
-/// 1001.
+/// 1001: something stood in the way for too long.
 pub fn obstacle() -> Fault {
     fault(FAULT_OBSTACLE, FaultClass::Recoverable, "an obstacle stood in the way for too long")
 }
-/// 1002.
+/// 1002: a pick closed on nothing.
 pub fn gripper_missed() -> Fault {
     fault(FAULT_GRIPPER_MISSED, FaultClass::Recoverable, "the gripper closed on nothing")
 }
-/// 2001.
+/// 2001: a person must free a joint.
 pub fn jam() -> Fault {
     fault(FAULT_JAM, FaultClass::Mechanical, "a joint is jammed")
 }
-/// 2002.
+/// 2002: a person must bring it to a charger.
 pub fn battery_empty() -> Fault {
     fault(FAULT_BATTERY_EMPTY, FaultClass::Mechanical, "the battery is empty")
 }
-/// 2003.
+/// 2003: a drop found nothing in the gripper.
 pub fn load_lost() -> Fault {
     fault(FAULT_LOAD_LOST, FaultClass::Mechanical, "nothing is carried that could be put down")
 }
-/// 3001.
+/// 3001: the agent may not drive now.
 pub fn manual() -> Fault {
     fault(FAULT_MANUAL, FaultClass::Stop, "a person drives")
 }
-/// 4001.
+/// 4001: the step makes no sense for this body.
 pub fn semantic(message: &str) -> Fault {
     fault(FAULT_SEMANTIC, FaultClass::Semantic, message)
 }

@@ -1,7 +1,8 @@
-//! The effects journal: each physical pick and drop, and each place a body's contour entered or left, in the order it happened.
+//! The effects journal: each physical pick and drop, and each place a body's contour entered or left, in the order it
+//! happened.
 //!
-//! Invariant: an entry is written by the body that did it, with one write call, and never changed; a killed process leaves
-//! all it has written. It is what runs are judged by ([`crate::oracle`]).
+//! Invariant: an entry is written by the body that did it, with one write call, and never changed; a killed process
+//! leaves all it has written. It is what runs are judged by ([`crate::judge`]).
 
 use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
 use midshift_core::robot::StopLevel;

@@ -1,7 +1,9 @@
-//! Stands in for the launcher of each robot of a swarm, and for what a robot's program does with the set that it is started from.
+//! Stands in for the launcher of each robot of a swarm, and for what a robot's program does with the set that it is
+//! started from.
 //!
-//! Which set starts, its tries and its end on trial are decided as for a real robot ([`midshift_agent::starts`]); of the set only
-//! `behaviour.toml` is read. Invariant: the switch record is written here only while no agent of that robot runs. Called by [`crate::swarm`] and by simulations.
+//! Which set starts, its tries and its end on trial are decided as for a real robot ([`midshift_agent::start_policy`]);
+//! of the set only `behaviour.toml` is read. Invariant: the switch record is written here only while no agent of that
+//! robot runs. Called by [`crate::swarm`] and by simulations.
 
 use crate::behaviour::{Behaviour, COMPONENT, FILE_BYTES_MAX};
 use crate::handle::SimHandle;
@@ -10,7 +12,7 @@ use midshift_agent::session::Updates;
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::sets::{self, Holdings, Sets};
-use midshift_agent::starts::{self, Tries};
+use midshift_agent::start_policy::{self, Tries};
 use midshift_agent::trust::Trust;
 use midshift_agent::update::UpdateConfig;
 use midshift_agent::update::io::UpdateWorker;
@@ -88,7 +90,7 @@ impl Launched {
         let mut holdings = sets.holdings()?;
         let mut tries = lock(&self.tries);
         let tried = holdings.switch.running().to_owned();
-        if let Some(had) = starts::put_away(&mut holdings.switch, &tries) {
+        if let Some(had) = start_policy::put_away(&mut holdings.switch, &tries) {
             tracing::warn!(robot_id = %robot.robot_id(), set = tried, tries = had, "set did not live and was put away");
             sets.write_switch(&mut holdings.switch)?;
         }
@@ -148,7 +150,7 @@ impl Launched {
     /// Sets that cannot be read.
     pub fn use_up_tries(&self) -> Result<(), sets::Error> {
         let holdings = self.holdings()?;
-        *lock(&self.tries) = Tries::new(holdings.switch.running(), starts::TRIES_MAX);
+        *lock(&self.tries) = Tries::new(holdings.switch.running(), start_policy::TRIES_MAX);
         Ok(())
     }
 
@@ -165,9 +167,9 @@ impl Launched {
         let mut pulses = 0_u32;
         Box::new(move || {
             pulses = pulses.saturating_add(1);
-            if starts::is_well(pulses)
+            if start_policy::is_well(pulses)
                 && let Ok(holdings) = kept.open().and_then(|mut sets| sets.holdings())
-                && starts::is_trusted(&holdings.switch)
+                && start_policy::is_trusted(&holdings.switch)
             {
                 *lock(&tries) = Tries::default();
             }

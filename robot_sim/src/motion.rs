@@ -1,4 +1,5 @@
-//! Closed-form motion: where a body is on one leg of its path follows from where and when it set out, and from when it was told to brake.
+//! Closed-form motion: where a body is on one leg of its path follows from where and when it set out, and from when it
+//! was told to brake.
 //!
 //! Invariant: nothing here is integrated over ticks, so a leg looks the same however often it is asked.
 //! Called by [`crate::body`].
@@ -8,7 +9,8 @@ use nalgebra::{Isometry2, Rotation2, Translation2, UnitComplex, Vector2};
 
 /// How fast a body turns on the spot, radians per second.
 pub const TURN_RAD_S: f64 = 2.0;
-/// How a body brakes that is told to stand, millimetres per second squared: from 1.5 m/s it stands after a second and 750 mm.
+/// How a body brakes that is told to stand, millimetres per second squared: from 1.5 m/s it stands after a second and
+/// 750 mm.
 pub const BRAKES_MM_S2: f64 = 1_500.0;
 /// The same, millimetres per millisecond squared.
 const BRAKES_MM_MS2: f64 = BRAKES_MM_S2 / 1e6;
@@ -59,8 +61,8 @@ impl Leg {
     pub fn length_mm(&self) -> f64 {
         self.length_mm
     }
-    /// Millimetres driven at `now`, 0 before. It goes no further than the whole length, also where it is still braking there: the way beyond
-    /// may not be its own.
+    /// Millimetres driven at `now`, 0 before. It goes no further than the whole length, also where it is still braking
+    /// there: the way beyond may not be its own.
     pub fn driven_mm(&self, now: SiteTime) -> f64 {
         let driving_ms = self.driving_ms(now);
         let Some(from_ms) = self.brakes_ms.filter(|from| *from < driving_ms) else {

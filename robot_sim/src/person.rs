@@ -1,4 +1,5 @@
-//! The simulated person of the hall: clears what is broken and carries back what a robot was left with, after some minutes.
+//! The simulated person of the hall: clears what is broken and carries back what a robot was left with, after some
+//! minutes.
 //!
 //! Invariant: a person acts on bodies alone and knows of the server only which tasks live, if told.
 //! Called every few seconds of site time by whoever runs the swarm.
@@ -47,9 +48,9 @@ impl Person {
     pub fn new(seed: u64) -> Self {
         Self { rng: ChaCha8Rng::seed_from_u64(seed ^ 0x7065_7273_6f6e), due: BTreeMap::new() }
     }
-    /// Looks at every robot, remembers what is new, and does what is due. `live` says whether a task still wants its item
-    /// from the robot that carries it; without knowledge of tasks say `false`: then a load goes back from any robot that
-    /// has stood without an order for as long as it takes the person to come.
+    /// Looks at every robot, remembers what is new, and does what is due. `live` says whether a task still wants its
+    /// item from the robot that carries it; without knowledge of tasks say `false`: then a load goes back from any
+    /// robot that has stood without an order for as long as it takes the person to come.
     pub fn round(&mut self, now: SiteTime, robots: &[SimHandle], live: &dyn Fn(&TaskId) -> bool) -> Vec<Deed> {
         let mut deeds = Vec::new();
         for robot in robots {

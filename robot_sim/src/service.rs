@@ -1,12 +1,13 @@
 //! The simulator's own face on the wire: faults in, bodies and the world of items out.
 //!
-//! Invariant: what it answers comes from the bodies and their journals, never from the server. Registered by `dev` and `sim run` only.
+//! Invariant: what it answers comes from the bodies and their journals, never from the server. Registered by `dev` and
+//! `sim run` only.
 
 use crate::body::SimBody;
 use crate::faults::Injected;
-use crate::hall::Hall;
+use crate::fleet::Fleet;
 use crate::handle::SimHandle;
-use crate::oracle::Verdict;
+use crate::judge::Verdict;
 use crate::world::{lock, sku_of};
 use midshift_agent::body::Body as _;
 use midshift_core::ids::RobotId;
@@ -32,15 +33,15 @@ pub type Crash = Arc<dyn Fn(&RobotId) -> bool + Send + Sync>;
 /// The service.
 #[derive(Clone)]
 pub struct SimFace {
-    hall: Arc<Hall>,
+    fleet: Arc<Fleet>,
     clock: Arc<dyn Clock>,
     crash: Crash,
 }
 
 impl SimFace {
-    /// For the robots of a hall.
-    pub fn new(hall: Arc<Hall>, clock: Arc<dyn Clock>, crash: Crash) -> Self {
-        Self { hall, clock, crash }
+    /// For the robots of a fleet.
+    pub fn new(fleet: Arc<Fleet>, clock: Arc<dyn Clock>, crash: Crash) -> Self {
+        Self { fleet, clock, crash }
     }
     /// With this face.
     pub fn add_to(self, routes: Routes) -> Routes {
@@ -49,7 +50,7 @@ impl SimFace {
     fn inject(&self, request: v1::InjectFaultRequest) -> Result<(), Refusal> {
         let robot_id = RobotId::parse(&request.robot_id).map_err(|e| Refusal::field("robot_id", e.to_string()))?;
         let fault = request.fault.ok_or_else(|| Refusal::field("fault", "one fault must be named"))?;
-        let robot = self.hall.robot(&robot_id).ok_or_else(|| unknown(&robot_id))?;
+        let robot = self.fleet.robot(&robot_id).ok_or_else(|| unknown(&robot_id))?;
         match read(fault, self.clock.rate_permille())? {
             Some(what) => robot.inject(self.clock.now().site, what),
             None if (self.crash)(&robot_id) => {}
@@ -67,8 +68,8 @@ impl SimFace {
             _ => return Err(Refusal::field("page_size", format!("must be 0..={PAGE_MAX}"))),
         };
         let after = |r: &SimHandle| r.robot_id().as_str() > request.page_token.as_str();
-        let first = self.hall.robots().partition_point(|r| !after(r));
-        let page: Vec<_> = self.hall.robots()[first..].iter().take(size + 1).collect();
+        let first = self.fleet.robots().partition_point(|r| !after(r));
+        let page: Vec<_> = self.fleet.robots()[first..].iter().take(size + 1).collect();
         let more = page.len() > size;
         let page = &page[..page.len().min(size)];
         let last = page.last().filter(|_| more).map(|r| r.robot_id().to_string());
@@ -80,7 +81,7 @@ impl SimFace {
     fn world(&self) -> Result<v1::GetWorldResponse, Refusal> {
         use v1::world_stock::Where;
         let mut stocks: BTreeMap<(bool, String, String), u64> = BTreeMap::new();
-        for world in self.hall.worlds() {
+        for world in self.fleet.worlds() {
             let world = lock(world);
             let lying = world.lying().map(|(at, item)| (false, at.to_string(), sku_of(item).to_owned()));
             let carried = world.carrying().map(|(robot, c)| (true, robot.to_string(), sku_of(&c.item).to_owned()));
@@ -101,7 +102,7 @@ impl SimFace {
         })
     }
     fn verdict(&self) -> Result<Verdict, Refusal> {
-        self.hall.verdict().map_err(|error| {
+        self.fleet.verdict().map_err(|error| {
             tracing::error!(%error, "journals not read");
             Refusal::new(Kind::Internal, Code::StoreUnavailable)
         })

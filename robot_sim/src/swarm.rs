@@ -1,9 +1,9 @@
-//! A swarm: one agent for each body of a hall, in one process, with the person who walks among them.
+//! A swarm: one agent for each body of a fleet, in one process, with the person who walks among them.
 //!
-//! Invariant: each agent is the one a real robot runs, unchanged; only its body, its network and its crashes are simulated.
-//! Called by `dev`, `sim run`, the bench and the tests.
+//! Invariant: each agent is the one a real robot runs, unchanged; only its body, its network and its crashes are
+//! simulated. Called by `dev`, `sim run`, the bench and the tests.
 
-use crate::hall::{Hall, Persistence};
+use crate::fleet::{Fleet, Persistence};
 use crate::handle::SimHandle;
 use crate::launched::{Launched, Start};
 use crate::service::Crash;
@@ -16,7 +16,7 @@ use midshift_agent::memory::MemoryStore;
 use midshift_agent::session::{self, AgentConfig, Lines};
 use midshift_agent::sets;
 use midshift_agent::sqlite::SqliteStore;
-use midshift_agent::starts::HANG_SECONDS;
+use midshift_agent::start_policy::HANG_SECONDS;
 use midshift_agent::stop::keep::{FileStops, KeepStops, MemoryStops, STOP_FILE};
 use midshift_agent::stop::line::StopLine;
 use midshift_agent::store::{self, Store};
@@ -89,7 +89,7 @@ pub enum Error {
 #[derive(Clone)]
 pub struct SwarmConfig {
     /// Its bodies.
-    pub hall: Arc<Hall>,
+    pub fleet: Arc<Fleet>,
     /// Both clocks.
     pub clock: Arc<dyn Clock>,
     /// The way to the server.
@@ -108,7 +108,7 @@ pub struct SwarmConfig {
     pub spread: Duration,
     /// Naive rules for twins of tests; none outside them.
     pub bugs: Bugs,
-    /// Which tasks a person leaves to their robots; none: nobody walks the hall.
+    /// Which tasks a person leaves to their robots; none: nobody walks about.
     pub person: Option<Live>,
     /// What they believe of software; none: theirs is not changed.
     pub software: Option<Trust>,
@@ -125,15 +125,15 @@ impl SwarmConfig {
         Self { stop: Some(dial), ..self }
     }
     /// Over TCP to `http://host:port`, all in memory, with a person to whom no load is dear.
-    pub fn tcp(hall: Arc<Hall>, clock: Arc<dyn Clock>, uri: &str, seed: u64) -> Self {
-        Self::over(hall, clock, uri, Arc::default(), seed)
+    pub fn tcp(fleet: Arc<Fleet>, clock: Arc<dyn Clock>, uri: &str, seed: u64) -> Self {
+        Self::over(fleet, clock, uri, Arc::default(), seed)
     }
     /// As [`SwarmConfig::tcp`], to `https://host:port` for those robots that have a way to speak TLS.
-    pub fn over(hall: Arc<Hall>, clock: Arc<dyn Clock>, uri: &str, tls: TlsOf, seed: u64) -> Self {
+    pub fn over(fleet: Arc<Fleet>, clock: Arc<dyn Clock>, uri: &str, tls: TlsOf, seed: u64) -> Self {
         let (link, bulk) = (uri.to_owned(), uri.to_owned());
         let (link_tls, bulk_tls) = (tls.clone(), tls.clone());
         Self {
-            hall,
+            fleet,
             clock,
             dial: Arc::new(move |robot, network| {
                 Ok(Arc::new(TcpDial::new(&link, Some(network))?.with_tls(link_tls.get(robot).cloned())))
@@ -171,10 +171,11 @@ pub struct Swarm {
 impl Swarm {
     /// Ready to run.
     pub fn new(config: SwarmConfig) -> Self {
-        let crashes = config.hall.robots().iter().map(|r| (r.robot_id().clone(), Notify::new()));
+        let crashes = config.fleet.robots().iter().map(|r| (r.robot_id().clone(), Notify::new()));
         Self { crashes: Arc::new(crashes.collect()), config }
     }
-    /// Crashes one agent: its task is dropped where it is, its body stands, and it is started again from what it had kept.
+    /// Crashes one agent: its task is dropped where it is, its body stands, and it is started again from what it had
+    /// kept.
     pub fn crash(&self) -> Crash {
         let crashes = self.crashes.clone();
         Arc::new(move |robot_id| crashes.get(robot_id).inspect(|c| c.notify_one()).is_some())
@@ -187,7 +188,7 @@ impl Swarm {
             let mut agents = JoinSet::new();
             let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed ^ 0x7377_6172);
             let spread_us = self.config.spread.as_micros() as u64;
-            for robot in self.config.hall.robots() {
+            for robot in self.config.fleet.robots() {
                 let life = Life {
                     config: self.config.clone(),
                     robot: robot.clone(),
@@ -227,7 +228,7 @@ async fn walk(config: SwarmConfig) -> Infallible {
     let rate = u64::from(config.clock.rate_permille()).max(1);
     loop {
         tokio::time::sleep(Duration::from_millis((ROUND_MS * 1000 / rate).max(1))).await;
-        for deed in config.hall.person_round(config.clock.now().site, &*live) {
+        for deed in config.fleet.person_round(config.clock.now().site, &*live) {
             tracing::info!(?deed, "a person helped");
         }
     }
@@ -370,7 +371,8 @@ impl Life {
             pulse: launched.map(Launched::pulse),
         })
     }
-    /// Its way to the stop service, if the swarm has one, and what it keeps of stops: across its crashes, as a disk would.
+    /// Its way to the stop service, if the swarm has one, and what it keeps of stops: across its crashes, as a disk
+    /// would.
     fn stop_line(&self) -> Result<Option<StopLine>, Error> {
         let Some(dial) = &self.config.stop else { return Ok(None) };
         let robot_id = self.robot.robot_id();

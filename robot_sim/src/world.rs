@@ -4,7 +4,7 @@
 //! Called by bodies and by the simulated person, under one lock.
 
 use crate::journal::{self, Effect, Entry, Journal, Work};
-use crate::oracle::Oracle;
+use crate::judge::Judge;
 use midshift_core::ids::{PlaceId, RobotId, WaypointId};
 use midshift_core::site::Site;
 use midshift_core::time::SiteTime;
@@ -54,7 +54,7 @@ pub struct World {
     lying: BTreeMap<WaypointId, VecDeque<String>>,
     carried: BTreeMap<RobotId, Carried>,
     journal: Journal,
-    oracle: Oracle,
+    judge: Judge,
 }
 
 /// A world behind its lock.
@@ -63,14 +63,14 @@ pub type SharedWorld = Arc<Mutex<World>>;
 impl World {
     /// An empty world whose journal stays in memory.
     pub fn new(config: WorldConfig, site: &Site) -> Self {
-        let oracle = if config.crowded { Oracle::default() } else { Oracle::of_site(site) };
+        let judge = if config.crowded { Judge::default() } else { Judge::of_site(site) };
         Self {
             config,
             next_number: 1,
             lying: BTreeMap::new(),
             carried: BTreeMap::new(),
             journal: Journal::memory(),
-            oracle,
+            judge,
         }
     }
     /// The world as its journal's file tells it, going on in the same file.
@@ -79,7 +79,7 @@ impl World {
         let entries = journal::read(path)?;
         world.journal = Journal::open(path)?;
         for entry in &entries {
-            world.oracle.take(entry);
+            world.judge.judge_entry(entry);
             world.replay(entry);
         }
         Ok(world)
@@ -165,8 +165,8 @@ impl World {
         &self.journal
     }
     /// The judge of its journal.
-    pub fn oracle(&self) -> &Oracle {
-        &self.oracle
+    pub fn judge(&self) -> &Judge {
+        &self.judge
     }
     /// UTC on the site clock, milliseconds.
     pub fn utc_ms(&self, now: SiteTime) -> i64 {
@@ -186,7 +186,7 @@ impl World {
     fn record(&mut self, now: SiteTime, robot: Option<&RobotId>, effect: Effect) {
         let entry = Entry { utc_ms: self.utc_ms(now), site_ms: now.0, robot_id: robot.cloned(), effect };
         self.replay(&entry);
-        self.oracle.take(&entry);
+        self.judge.judge_entry(&entry);
         self.journal.append(entry);
     }
     /// The one place where the world changes.

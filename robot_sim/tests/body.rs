@@ -358,7 +358,7 @@ fn a_killed_body_comes_back_where_it_was_with_its_load_its_battery_and_its_place
     run(&mut body, SiteTime(0), SiteTime(10_000));
     body.start(SiteTime(10_000), drive(&["a-out", "wait-a", "c-1", "c-2"])).expect("starts");
     run(&mut body, SiteTime(10_000), SiteTime(18_000));
-    let (left, items) = (body.state(SiteTime(18_000)), lock(&world).oracle().verdict());
+    let (left, items) = (body.state(SiteTime(18_000)), lock(&world).judge().verdict());
     let inside = body.inside().clone();
     drop((body, world));
 
@@ -371,7 +371,7 @@ fn a_killed_body_comes_back_where_it_was_with_its_load_its_battery_and_its_place
     assert_eq!(inside.iter().map(|p| p.as_str()).collect::<Vec<_>>(), ["corridor"]);
     assert_eq!(body.load().expect("loaded").task_id, Some(task("T-1")));
     assert_eq!(body.check(&action("pick", "SKU-1"), Some(&task("T-1"))), Checked::Done);
-    assert_eq!(lock(&world).oracle().verdict(), items);
+    assert_eq!(lock(&world).judge().verdict(), items);
     assert!(body.standstill(SiteTime(5)));
 }
 
@@ -474,7 +474,7 @@ proptest! {
             prop_assert_eq!(body.load().is_some(), lock(&world).carrying().count() == 1);
             was = after;
         }
-        let verdict = lock(&world).oracle().verdict();
+        let verdict = lock(&world).judge().verdict();
         prop_assert!(verdict.items_conserved(), "{verdict:?}");
     }
 }

@@ -1,4 +1,4 @@
-//! What the judge finds in journals, what the person does in the hall, and that work is drawn from its seed alone.
+//! What the judge finds in journals, what the person does in the fleet, and that work is drawn from its seed alone.
 
 use midshift_agent::body::{Body, BodyOrder, PathPoint};
 use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
@@ -10,7 +10,7 @@ use midshift_sim::body::{BodyConfig, SimBody};
 use midshift_sim::faults::{FaultRates, Injected};
 use midshift_sim::handle::SimHandle;
 use midshift_sim::journal::{self, Effect, Entry, Journal, Work};
-use midshift_sim::oracle::{Oracle, Verdict};
+use midshift_sim::judge::{Judge, Verdict};
 use midshift_sim::person::{Deed, Person};
 use midshift_sim::workload::{Workload, WorkloadConfig};
 use midshift_sim::world::{ITEMS_PER_PLACE_MAX, SharedWorld, World, WorldConfig, lock};
@@ -40,9 +40,9 @@ fn stay(name: &str, from_ms: i64, to_ms: i64) -> [Entry; 2] {
     ]
 }
 fn judge(capacity: u32, entries: impl IntoIterator<Item = Entry>) -> Verdict {
-    let mut oracle = Oracle::new([(place("corridor"), capacity)]);
-    entries.into_iter().for_each(|e| oracle.take(&e));
-    oracle.verdict()
+    let mut judge = Judge::new([(place("corridor"), capacity)]);
+    entries.into_iter().for_each(|e| judge.judge_entry(&e));
+    judge.verdict()
 }
 fn corridor() -> Arc<Site> {
     Arc::new(text::parse(CORRIDOR).expect("the corridor is a site"))
@@ -76,7 +76,7 @@ fn two_bodies_in_an_exclusive_passage_are_found_from_what_they_drove() {
     for body in [&mut east, &mut west] {
         body.poll(SiteTime(60_000));
     }
-    let verdict = lock(&world).oracle().verdict();
+    let verdict = lock(&world).judge().verdict();
     assert_eq!(verdict.exclusion_violations, 1, "{verdict:?}");
     assert_eq!(verdict.violations_by_robot.keys().collect::<Vec<_>>(), [&robot("rbt-02")]);
 }
@@ -91,7 +91,7 @@ fn one_after_the_other_is_no_violation_even_if_the_first_says_so_late() {
     west.start(SiteTime(30_000), path(&site, &["c-2", "c-1", "a-in"])).expect("starts");
     west.poll(SiteTime(60_000));
     east.poll(SiteTime(60_000));
-    let verdict = lock(&world).oracle().verdict();
+    let verdict = lock(&world).judge().verdict();
     assert_eq!((verdict.exclusion_violations, verdict.is_clean()), (0, true), "{verdict:?}");
 }
 
@@ -136,7 +136,7 @@ fn a_full_place_ships_its_oldest_and_nothing_is_lost() {
     let site = corridor();
     let mut world = World::new(WorldConfig::default(), &site);
     world.stock(SiteTime(0), &waypoint("A"), "SKU-1", ITEMS_PER_PLACE_MAX as u32 + 3);
-    let verdict = world.oracle().verdict();
+    let verdict = world.judge().verdict();
     assert_eq!((verdict.items_shipped, verdict.items_at_places), (3, ITEMS_PER_PLACE_MAX as u64));
     assert!(verdict.is_clean());
 }
@@ -201,7 +201,7 @@ fn the_person_carries_back_what_no_live_task_wants_and_leaves_the_rest() {
     assert!(robot.load().is_some());
     assert_eq!(walk(&mut person, 400, false), [Deed::CarriedBack(robot.robot_id().clone())]);
     assert_eq!(robot.load(), None);
-    let verdict = lock(&world).oracle().verdict();
+    let verdict = lock(&world).judge().verdict();
     assert_eq!((verdict.items_at_places, verdict.is_clean()), (1, true));
 }
 

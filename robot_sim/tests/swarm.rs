@@ -6,7 +6,7 @@ use midshift_core::ids::RobotId;
 use midshift_core::site::{CORRIDOR, text};
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_sim::faults::{FaultRates, Injected};
-use midshift_sim::hall::{Hall, HallConfig};
+use midshift_sim::fleet::{Fleet, FleetConfig};
 use midshift_sim::swarm::{Swarm, SwarmConfig, SwarmEnd};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -33,19 +33,19 @@ fn clock() -> Arc<dyn Clock> {
 type Starts = Arc<Mutex<BTreeMap<RobotId, u32>>>;
 
 /// A swarm of three without a server, and how often each agent was started.
-fn swarm() -> (Arc<Hall>, Swarm, Starts) {
+fn swarm() -> (Arc<Fleet>, Swarm, Starts) {
     let site = Arc::new(text::parse(CORRIDOR).expect("a site"));
     let clock = clock();
-    let quiet = HallConfig { faults: FaultRates::none(), ..HallConfig::new(site, 3, 7) };
-    let hall = Arc::new(Hall::open(&quiet, &clock.now()).expect("opens"));
+    let quiet = FleetConfig { faults: FaultRates::none(), ..FleetConfig::new(site, 3, 7) };
+    let fleet = Arc::new(Fleet::open(&quiet, &clock.now()).expect("opens"));
     let starts = Arc::new(Mutex::new(BTreeMap::new()));
     let counted = starts.clone();
-    let mut config = SwarmConfig::tcp(hall.clone(), clock, "http://127.0.0.1:1", 7);
+    let mut config = SwarmConfig::tcp(fleet.clone(), clock, "http://127.0.0.1:1", 7);
     config.dial = Arc::new(move |robot, _| {
         *counted.lock().expect("no panic").entry(robot.clone()).or_insert(0) += 1;
         Ok(Arc::new(Nowhere))
     });
-    (hall, Swarm::new(config), starts)
+    (fleet, Swarm::new(config), starts)
 }
 
 #[tokio::test(start_paused = true)]
@@ -66,14 +66,14 @@ async fn a_crashed_agent_is_started_again_and_the_others_go_on() {
 
 #[tokio::test(start_paused = true)]
 async fn a_person_walks_the_hall_while_a_swarm_runs() {
-    let (hall, swarm, _) = swarm();
+    let (fleet, swarm, _) = swarm();
     let shutdown = CancellationToken::new();
     let running = tokio::spawn(swarm.run(shutdown.clone()));
-    hall.robots()[0].inject(midshift_core::time::SiteTime(0), Injected::Jam);
+    fleet.robots()[0].inject(midshift_core::time::SiteTime(0), Injected::Jam);
     tokio::time::sleep(Duration::from_secs(5)).await;
-    assert!(hall.robots()[0].lock().broken().is_some(), "100 s of site time: nobody came yet");
+    assert!(fleet.robots()[0].lock().broken().is_some(), "100 s of site time: nobody came yet");
     tokio::time::sleep(Duration::from_secs(11)).await;
-    assert!(hall.robots()[0].lock().broken().is_none(), "320 s of site time");
+    assert!(fleet.robots()[0].lock().broken().is_none(), "320 s of site time");
     shutdown.cancel();
     running.await.expect("no panic").expect("ends well");
 }

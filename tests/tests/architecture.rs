@@ -51,7 +51,7 @@ const SYNCED_BY_HAND: &[(&str, &str)] = &[
     ("robot_agent/src/sets/content.rs", "a download comes a piece at a time"),
     ("robot_agent/src/sets/disk.rs", "content is made a piece at a time and read back by the same handle"),
     ("robot_agent/src/sets/slots.rs", "a slot stands for a partition, which has no other beside it"),
-    ("robot_sim/src/body/kept.rs", "a simulated body notes where it stands at each turn of its way"),
+    ("robot_sim/src/body/files.rs", "a simulated body notes where it stands at each turn of its way"),
     ("services/identity/src/revocation_list.rs", "a line at a time"),
     ("services/midshift/src/backup/place.rs", "a name that may not stay is taken back"),
     ("services/ota/src/content.rs", "an upload comes a piece at a time"),
@@ -108,26 +108,30 @@ const TOLD: [&str; 30] = [
 ];
 /// Fields of such a name, or shown whole, that are neither. Each for a reason.
 const LOGGED: &[(&str, &str, &str)] = &[
-    ("robot_agent/src/core.rs", "replayed", "numbers of samples"),
-    ("robot_agent/src/session.rs", "why", "what the transport said, and sentences of this program"),
+    ("robot_agent/src/core/step.rs", "replayed", "numbers of samples"),
+    ("robot_agent/src/session/mod.rs", "why", "what the transport said, and sentences of this program"),
     ("robot_agent/src/stop/line.rs", "why", "what the transport said, and sentences of this program"),
     (
-        "robot_agent/src/stop/obey.rs",
+        "robot_agent/src/core/stops.rs",
         "why",
         "which field of the link's stops breaks a rule, in the words of the decoder",
     ),
-    ("robot_agent/src/stop/obey.rs", "level", "one of four words"),
-    ("robot_agent/src/stop/obey.rs", "stops", "ids"),
-    ("robot_agent/src/stop/obey.rs", "awaiting_resume", "ids"),
-    ("robot_agent/src/update/believes.rs", "rejection", "one of a closed list of sentences about signed documents"),
-    ("robot_agent/src/update/believes.rs", "keys", "digests"),
-    ("robot_agent/src/update/standing.rs", "sets", "digests"),
-    ("robot_agent/src/update/standing.rs", "why", "which file of a set has which digest, in sentences of this program"),
+    ("robot_agent/src/core/stops.rs", "level", "one of four words"),
+    ("robot_agent/src/core/stops.rs", "stops", "ids"),
+    ("robot_agent/src/core/stops.rs", "awaiting_resume", "ids"),
+    ("robot_agent/src/core/update/beliefs.rs", "rejection", "one of a closed list of sentences about signed documents"),
+    ("robot_agent/src/core/update/beliefs.rs", "keys", "digests"),
+    ("robot_agent/src/core/update/integrity.rs", "sets", "digests"),
+    (
+        "robot_agent/src/core/update/integrity.rs",
+        "why",
+        "which file of a set has which digest, in sentences of this program",
+    ),
     ("robot_agent/src/update/io.rs", "base", "a digest"),
-    ("robot_agent/src/update/pursue.rs", "why", "what the transport or a disk said"),
-    ("robot_agent/src/update/pursue.rs", "from", "one of a closed list of states"),
-    ("robot_agent/src/update/pursue.rs", "to", "one of a closed list of states"),
-    ("robot_agent/src/update/pursue.rs", "state", "one of a closed list of states"),
+    ("robot_agent/src/core/update/results.rs", "why", "what the transport or a disk said"),
+    ("robot_agent/src/core/update/record.rs", "from", "one of a closed list of states"),
+    ("robot_agent/src/core/update/record.rs", "to", "one of a closed list of states"),
+    ("robot_agent/src/core/update/record.rs", "state", "one of a closed list of states"),
     ("robot_sim/src/swarm.rs", "deed", "a word and an id"),
     ("robot_sim/src/swarm.rs", "why", "what the operating system said of a program"),
     ("services/fleet/src/reconcile.rs", "text", "the key of a row, and what could not be read of it"),
@@ -495,7 +499,7 @@ fn there_is_no_unbounded_queue() {
 fn wall_and_monotonic_clocks_are_read_by_the_binaries_alone() {
     // The launcher is a program of its own, kept beside the switch record that it reads. Programs of makers have the agent's clock.
     let binaries =
-        ["services/midshift/", "robot_agent/src/bin/", "robot_agent/src/launcher.rs", "robot_agent/src/clock.rs"];
+        ["services/midshift/", "robot_agent/src/bin/", "robot_agent/src/launcher/mod.rs", "robot_agent/src/clock.rs"];
     for room in ["cli/src", "services", "robot_agent/src", "robot_sim/src"] {
         for path in
             files(room, "rs").into_iter().filter(|p| p.contains("src/") && !binaries.iter().any(|b| p.starts_with(b)))

@@ -3,7 +3,7 @@
 use midshift_agent::trust::Trust;
 use midshift_core::time::Clock;
 use midshift_sim::faults::FaultRates;
-use midshift_sim::hall::{Hall, HallConfig};
+use midshift_sim::fleet::{Fleet, FleetConfig};
 use midshift_sim::swarm::{Swarm, SwarmConfig};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -30,8 +30,8 @@ pub struct SwarmArgs {
 pub async fn run(args: SwarmArgs, stop: CancellationToken) -> anyhow::Result<()> {
     let site = midshift_cli::site_file::load(Some(&args.site), None, None)?.site;
     let clock: Arc<dyn Clock> = midshift::clock::clock(1000);
-    let config = HallConfig { faults: FaultRates::none(), drains: false, ..HallConfig::new(site, args.robots, SEED) };
-    let hall = Arc::new(Hall::open(&config, &clock.now())?);
+    let config = FleetConfig { faults: FaultRates::none(), drains: false, ..FleetConfig::new(site, args.robots, SEED) };
+    let hall = Arc::new(Fleet::open(&config, &clock.now())?);
     let uri = midshift_cli::way::uri(&args.server);
     let mut swarm = SwarmConfig::tcp(hall, clock, &uri, SEED);
     swarm.software = Some(Trust::read(&args.trust)?);

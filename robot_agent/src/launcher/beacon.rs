@@ -10,7 +10,8 @@ use std::time::Duration;
 /// Time between two beacons.
 pub(super) const BEACON_EVERY: Duration = Duration::from_secs(1);
 
-/// Tells the server once a second that the robot is there while no agent runs. A hint for people: sent blind, believed by nobody.
+/// Tells the server once a second that the robot is there while no agent runs. A hint for people: sent blind, believed
+/// by nobody.
 pub(super) struct Beacon {
     socket: Option<(UdpSocket, String)>,
     robot_id: String,
@@ -30,7 +31,7 @@ impl Beacon {
 
     /// A program is started, at this second of Unix time.
     pub(super) fn begins(&mut self, start: &Start, since_unix_s: u64) {
-        let tries = start.tries.of(&start.set);
+        let tries = start.tries.count_of(&start.set);
         self.text = format!("midshift-beacon 1 {} {} {tries} {since_unix_s}\n", self.robot_id, start.set);
     }
 

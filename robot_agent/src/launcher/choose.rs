@@ -1,13 +1,15 @@
 //! Which set starts next, and on which base the machine runs for it.
 //!
-//! Invariant: the launcher writes the switch record and the boot record here only, and only while no child runs; while one runs, the agent writes
-//! them. Called by the launcher between two starts. What is decided stands in [`crate::starts`] and [`crate::boot`]; here it is carried out.
+//! Invariant: the launcher writes the switch record and the boot record here only, and only while no child runs; while
+//! one runs, the agent writes them. Called by the launcher between two starts. What is decided stands in
+//! [`super::start_policy`] and [`super::boot`]; here it is carried out.
 
+use super::boot::{BASE, BOOT, Boot, Image, Slot};
 use super::orders::Orders;
-use super::{PROGRAM, SWITCH, read_tries, say};
-use crate::boot::{BASE, BOOT, Boot, Image, Slot};
-use crate::starts::{self, Environment, Tries};
-use crate::switch::{self, Switch};
+use super::record::{read_tries, report};
+use super::start_policy::{self, Environment, Tries};
+use super::switch::{self, Switch};
+use super::terms::{PROGRAM, SWITCH};
 use std::fs;
 use std::io;
 use std::path::Path;
@@ -24,7 +26,8 @@ pub(super) struct Start {
     pub(super) number: u64,
 }
 
-/// A switch record that this launcher could not write, or does not yet: it holds as long as the one on the disk is the one that it was to follow.
+/// A switch record that this launcher could not write, or does not yet: it holds as long as the one on the disk is the
+/// one that it was to follow.
 #[derive(Default)]
 pub(super) struct Unwritten(Option<Switch>);
 
@@ -42,7 +45,11 @@ impl Unwritten {
     fn write(&mut self, switch: &mut Switch, path: &Path) -> u64 {
         let before = switch.number;
         let Err(error) = switch.write(path) else { return switch.number };
-        say(&format!("{} cannot be written: {error}; set {} is started without it", path.display(), switch.running()));
+        report(&format!(
+            "{} cannot be written: {error}; set {} is started without it",
+            path.display(),
+            switch.running()
+        ));
         self.0 = Some(switch.clone());
         before
     }
@@ -56,8 +63,8 @@ impl Unwritten {
     }
 }
 
-/// The set that the record names. One on trial that has had its tries is put away first; one that its environment has failed for long stands
-/// back for the kept set, and is put away only if that one is not failed the same way.
+/// The set that the record names. One on trial that has had its tries is put away first; one that its environment has
+/// failed for long stands back for the kept set, and is put away only if that one is not failed the same way.
 pub(super) fn choose(
     orders: &Orders,
     tries: &Tries,
@@ -72,25 +79,25 @@ pub(super) fn choose(
     let path = sets.join(SWITCH);
     let (mut switch, mut number) = unwritten.read(&path)?;
     let tried = switch.running().to_owned();
-    if let Some(had) = starts::put_away(&mut switch, tries) {
-        say(&format!("set {tried} did not live in {had} tries; back to {}", switch.current));
+    if let Some(had) = start_policy::put_away(&mut switch, tries) {
+        report(&format!("set {tried} did not live in {had} tries; back to {}", switch.current));
         number = unwritten.write(&mut switch, &path);
     }
-    let had = tries.of(switch.running());
+    let had = tries.count_of(switch.running());
     if environment.asks_kept(&switch, orders.patience, now) {
-        say(&format!("set {} is failed by its environment: is {} too?", switch.running(), switch.current));
+        report(&format!("set {} is failed by its environment: is {} too?", switch.running(), switch.current));
         switch.fall_back(had.max(1));
         unwritten.hold(&switch);
     }
     if !boot_into(sets, &switch, had)? {
         if switch.trial.is_some() {
-            say(&format!("set {} has a base that does not start; back to {}", switch.running(), switch.current));
+            report(&format!("set {} has a base that does not start; back to {}", switch.running(), switch.current));
             switch.fall_back(had.max(1));
             switch.number = number;
             number = unwritten.write(&mut switch, &path);
             boot_into(sets, &switch, had)?;
         } else {
-            say(&format!("set {} has no base that starts: it runs on the one that does", switch.running()));
+            report(&format!("set {} has no base that starts: it runs on the one that does", switch.running()));
         }
     }
     let set = switch.running().to_owned();
@@ -101,14 +108,14 @@ pub(super) fn choose(
     Ok(Start { tries: tries.plus_one(&set), program, set, number })
 }
 
-/// Starts that did not run well before this launcher. A record that cannot be read speaks against a set that has proven nothing, as if it had
-/// had all its tries; any other is started.
+/// Starts that did not run well before this launcher. A record that cannot be read speaks against a set that has proven
+/// nothing, as if it had had all its tries; any other is started.
 pub(super) fn tries_before(orders: &Orders) -> Tries {
     read_tries(&orders.record).unwrap_or_else(|error| {
-        say(&format!("{} cannot be read: {error}; a set on probation is put away", orders.record.display()));
+        report(&format!("{} cannot be read: {error}; a set on probation is put away", orders.record.display()));
         let switch = orders.sets.as_ref().and_then(|sets| Switch::read(&sets.join(SWITCH)).ok());
-        let unproven = switch.filter(|switch| !starts::is_trusted(switch));
-        unproven.map_or_else(Tries::default, |switch| Tries::new(switch.running(), starts::TRIES_MAX))
+        let unproven = switch.filter(|switch| !start_policy::is_trusted(switch));
+        unproven.map_or_else(Tries::default, |switch| Tries::new(switch.running(), start_policy::TRIES_MAX))
     })
 }
 
@@ -128,15 +135,15 @@ fn named(error: io::Error, path: &Path) -> io::Error {
     io::Error::new(error.kind(), format!("{}: {error}", path.display()))
 }
 
-/// Reads the boot record, changes it, and writes it if it became another. The record that lies there then: the one before, if it could not
-/// be written.
+/// Reads the boot record, changes it, and writes it if it became another. The record that lies there then: the one
+/// before, if it could not be written.
 pub(super) fn change_boot(sets: &Path, change: impl FnOnce(&mut Boot)) -> io::Result<Boot> {
     let path = sets.join(BOOT);
     let before = Boot::read(&path).map_err(|e| named(e, &path))?;
     let mut boot = before.clone();
     change(&mut boot);
     let Err(error) = boot.write_over(&before, &path) else { return Ok(boot) };
-    say(&format!("{} cannot be written: {error}; the machine stays on the base that it runs on", path.display()));
+    report(&format!("{} cannot be written: {error}; the machine stays on the base that it runs on", path.display()));
     Ok(before)
 }
 
@@ -169,7 +176,7 @@ pub(super) fn boot_into(sets: &Path, switch: &Switch, tries: u32) -> io::Result<
                 boot.ran_well();
             }
         } else if slot.is_some() {
-            say(&format!("the machine starts again, for the base {base}"));
+            report(&format!("the machine starts again, for the base {base}"));
             boot.start(|slot, image| starts_well(sets, slot, image));
         }
     })?;
@@ -180,5 +187,6 @@ pub(super) fn boot_into(sets: &Path, switch: &Switch, tries: u32) -> io::Result<
 pub(super) fn is_trusted(orders: &Orders, start: &Start) -> bool {
     let Some(sets) = &orders.sets else { return true };
     // The record may name one on trial that was put away and could not be written so.
-    Switch::read(&sets.join(SWITCH)).is_ok_and(|switch| starts::is_trusted(&switch) || switch.running() != start.set)
+    Switch::read(&sets.join(SWITCH))
+        .is_ok_and(|switch| start_policy::is_trusted(&switch) || switch.running() != start.set)
 }

@@ -1,9 +1,10 @@
 //! One launcher a robot: a lock of the operating system, held for the launcher's life.
 //!
-//! Invariant: a lock that another process has is an error; one that cannot be had for any other reason keeps no robot from being started.
+//! Invariant: a lock that another process has is an error; one that cannot be had for any other reason keeps no robot
+//! from being started.
 
 use super::orders::Orders;
-use super::say;
+use super::record::report;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io;
 
@@ -16,7 +17,7 @@ impl LauncherLock {
     ///
     /// # Errors
     /// Another launcher of this robot runs.
-    pub(super) fn take(orders: &Orders) -> io::Result<Self> {
+    pub(super) fn acquire(orders: &Orders) -> io::Result<Self> {
         let file = match open(orders) {
             Ok(file) => file,
             Err(error) => return Ok(Self::without(&error)),
@@ -31,7 +32,7 @@ impl LauncherLock {
     }
 
     fn without(error: &io::Error) -> Self {
-        say(&format!("no lock against a second launcher: {error}"));
+        report(&format!("no lock against a second launcher: {error}"));
         Self(None)
     }
 }

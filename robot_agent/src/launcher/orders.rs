@@ -2,7 +2,7 @@
 //!
 //! Invariant: it is read whole or refused. Called by the launcher when it begins.
 
-use crate::starts::{ENVIRONMENT_WAIT, HANG_SECONDS};
+use super::start_policy::{ENVIRONMENT_WAIT, HANG_SECONDS};
 use std::path::PathBuf;
 use std::time::Duration;
 

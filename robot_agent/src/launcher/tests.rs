@@ -1,12 +1,14 @@
 //! The launcher with real children.
 
+use super::boot::{BASE, BOOT, Boot, Image, Slot};
 use super::choose::{boot_into, change_boot};
+use super::record::{read_tries, write_tries};
+use super::start_policy::TRIES_MAX;
+use super::switch::{self, Switch};
 use super::*;
-use crate::boot::{BASE, BOOT, Boot, Image, Slot};
-use crate::starts::TRIES_MAX;
-use crate::switch::{self, Switch};
+use std::fs;
 use std::net::UdpSocket;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
 fn given(text: &str) -> Result<Orders, String> {
@@ -22,7 +24,7 @@ fn robot(script: &str) -> (TempDir, Orders) {
         sets: None,
         // Longer than a shell may take to begin on a machine that is busy.
         hang: Duration::from_secs(60),
-        patience: starts::ENVIRONMENT_WAIT,
+        patience: start_policy::ENVIRONMENT_WAIT,
         beacon: None,
         program: "sh".to_owned(),
         arguments,
@@ -46,7 +48,8 @@ fn with_sets(programs: &[(&str, &str)]) -> (TempDir, Orders) {
     (folder, orders)
 }
 
-/// By a child: a file that this process has had open for writing may not be run while another test starts a child of its own.
+/// By a child: a file that this process has had open for writing may not be run while another test starts a child of
+/// its own.
 fn write_program(path: &Path, script: &str) {
     let write = "printf '#!/bin/sh\\n%s\\n' \"$1\" > \"$2\" && chmod +x \"$2\"";
     let status = Command::new("sh").args(["-c", write, "sh", script]).arg(path).status();
@@ -115,7 +118,7 @@ fn a_program_that_fails_is_started_again_until_it_ends_well_and_its_tries_are_on
         fs::read_to_string(&seen).expect("was written"),
         "tries 1 of factory\ntries 2 of factory\ntries 3 of factory\n"
     );
-    assert_eq!(read_tries(&orders.record).expect("reads").of("factory"), 0);
+    assert_eq!(read_tries(&orders.record).expect("reads").count_of("factory"), 0);
 }
 
 #[test]
@@ -124,7 +127,9 @@ fn a_program_without_a_pulse_is_killed() {
     orders.hang = Duration::from_secs(1);
     let start = chosen(&orders);
     let (mut tries, mut environment, mut beacon) = (start.tries.clone(), Environment::default(), Beacon::new(&orders));
-    let ending = run_once(&orders, &start, &mut tries, &mut environment, &mut beacon).expect("runs");
+    let run =
+        Run { orders: &orders, start: &start, tries: &mut tries, environment: &mut environment, beacon: &mut beacon };
+    let ending = run_once(run).expect("runs");
     assert_eq!(ending, Ending::Hung);
 }
 
@@ -162,7 +167,11 @@ fn a_program_that_switched_is_followed_by_the_set_it_wrote_at_once_and_not_count
     keep_running(&orders).expect("runs");
     assert_eq!(ran(&folder), ["v1"]);
     let tries = read_tries(&orders.record).expect("reads");
-    assert_eq!((tries.of("v0"), tries.of("v1")), (0, 1), "the second one is on probation and has proven nothing");
+    assert_eq!(
+        (tries.count_of("v0"), tries.count_of("v1")),
+        (0, 1),
+        "the second one is on probation and has proven nothing"
+    );
 }
 
 #[test]
@@ -186,7 +195,7 @@ fn a_second_launcher_of_a_robot_starts_nothing_while_the_first_one_lives() {
     let (folder, orders) = with_sets(&[]);
     let (_alone, without_sets) = robot("exit 0");
     for orders in [&orders, &without_sets] {
-        let first = LauncherLock::take(orders).expect("is free");
+        let first = LauncherLock::acquire(orders).expect("is free");
         let error = keep_running(orders).expect_err("is refused");
         assert_eq!(error.kind(), io::ErrorKind::WouldBlock, "{error}");
         drop(first);
@@ -330,12 +339,12 @@ fn a_power_cut_counts_as_a_try_and_tries_of_another_set_do_not() {
     on_trial(&orders, "v1");
     for tries in [1, 2] {
         let start = chosen(&orders);
-        assert_eq!((start.set.as_str(), start.tries.of("v1")), ("v1", tries));
+        assert_eq!((start.set.as_str(), start.tries.count_of("v1")), ("v1", tries));
         write_tries(&orders.record, &start.tries).expect("writes");
     }
     assert_eq!(chosen(&orders).set, "factory", "twice the power went while it started");
     on_trial(&orders, "v2");
-    assert_eq!(chosen(&orders).tries.of("v2"), 1);
+    assert_eq!(chosen(&orders).tries.count_of("v2"), 1);
 }
 
 #[test]

@@ -1,8 +1,8 @@
 //! Sets of a robot in a folder.
 //!
 //! ```text
-//! switch            which set runs (crate::switch)
-//! boot              which base the machine starts from (crate::boot); base-a and base-b are its slots
+//! switch            which set runs (crate::launcher::switch)
+//! boot              which base the machine starts from (crate::launcher::boot); base-a and base-b are its slots
 //! switch.copy, boot.copy  the second copies of both
 //! content/DIGEST    bytes that were checked; DIGEST.part and DIGEST.map while they come, DIGEST.made while they are made of a shorter
 //!                   way, DIGEST.plain if no such way is to be tried
@@ -15,10 +15,10 @@
 
 use super::content::{Part, remove};
 use super::{CHUNK_BYTES, Error, Holdings, Sets, Wanted, base_name};
-use crate::boot::{BASE, BOOT};
+use crate::launcher::boot::{BASE, BOOT};
+use crate::launcher::start_policy::TRIES_MAX;
+use crate::launcher::switch::Switch;
 use crate::launcher::{PROGRAM, SWITCH};
-use crate::starts::TRIES_MAX;
-use crate::switch::Switch;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base};
 use midshift_bundle::manifest::{COMPONENT_BYTES_MAX, Component, ComponentKind, MANIFEST_BYTES_MAX};
@@ -70,8 +70,9 @@ impl DiskSets {
         Ok(Self { folder: folder.to_owned(), part: None, overtaken: None })
     }
 
-    /// Tells it which set the launcher has started. If the record names another one, which is on trial, the launcher has put that away and
-    /// could not write it down: it is taken as written, and written with whatever is written next.
+    /// Tells it which set the launcher has started. If the record names another one, which is on trial, the launcher
+    /// has put that away and could not write it down: it is taken as written, and written with whatever is written
+    /// next.
     ///
     /// # Errors
     /// A disk that cannot be read, or a damaged switch record.
@@ -253,7 +254,8 @@ fn verify_file(path: &Path, component: &Component) -> Result<(), Error> {
     if is_right { Ok(()) } else { Err(Error::Corrupt { digest: component.digest }) }
 }
 
-/// Deletes the folder of a set. Its page goes first and for good: without it the folder is no set, whatever else of it is left.
+/// Deletes the folder of a set. Its page goes first and for good: without it the folder is no set, whatever else of it
+/// is left.
 fn delete_set(folder: &Path) -> io::Result<()> {
     remove(&folder.join(SET_FILE))?;
     midshift_durable::sync_folder(folder)?;

@@ -1,12 +1,14 @@
-//! Sets of a swarm: in memory, shared by handle, so that a simulated crash keeps what a disk would and a power cut loses the rest.
+//! Sets of a swarm: in memory, shared by handle, so that a simulated crash keeps what a disk would and a power cut
+//! loses the rest.
 //!
-//! Invariant: it holds what was synced, sealed, staged or switched as long as one handle lives. Called by swarms and simulations.
+//! Invariant: it holds what was synced, sealed, staged or switched as long as one handle lives. Called by swarms and
+//! simulations.
 
 use super::content::Bitmap;
 use super::{Error, Holdings, Sets, Wanted, base_name};
-use crate::boot::{Boot, Image};
 use crate::launcher::PROGRAM;
-use crate::switch::{FACTORY, Switch};
+use crate::launcher::boot::{Boot, Image};
+use crate::launcher::switch::{FACTORY, Switch};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base};
 use midshift_bundle::manifest::ComponentKind;

@@ -1,15 +1,15 @@
 //! The software of a robot as files: content by digest, whole sets made of it, and the switch between them.
 //!
-//! Invariant: a set that the switch record names is whole and was read back from where it lies; nothing it needs is deleted. Every verb
-//! may be cut off anywhere and be done again. Two of them: [`disk`] for robots, [`memory`] for swarms and simulations; one contract suite
-//! runs over both.
+//! Invariant: a set that the switch record names is whole and was read back from where it lies; nothing it needs is
+//! deleted. Every verb may be cut off anywhere and be done again. Two of them: [`disk`] for robots, [`memory`] for
+//! swarms and simulations; one contract suite runs over both.
 
 mod content;
 pub mod disk;
 pub mod memory;
 mod slots;
 
-use crate::switch::{FACTORY, Switch};
+use crate::launcher::switch::{FACTORY, Switch};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::{Component, ComponentKind};
 use midshift_bundle::set::SetManifest;
@@ -20,8 +20,8 @@ use std::path::PathBuf;
 
 /// Bytes of one chunk: what a bitmap counts.
 pub const CHUNK_BYTES: u64 = 256 * 1024;
-/// Chunks after which a download is made durable: 1 MiB, so that a kill costs little beside a download (P9: 2 % of 256 MiB cut off four times), and
-/// a sync comes seldom beside the bytes of a line that robots have.
+/// Chunks after which a download is made durable: 1 MiB, so that a kill costs little beside a download (P9: 2 % of 256
+/// MiB cut off four times), and a sync comes seldom beside the bytes of a line that robots have.
 pub const CHUNKS_UNSYNCED_MAX: u64 = 4;
 
 /// Why the sets could not be used.
@@ -81,8 +81,8 @@ impl Holdings {
         }
         self.sets.get(&name.parse().ok()?).cloned()
     }
-    /// Version of a set, of the bundle taken last; none: what the robot came with. A set calls itself by the name and the version of its
-    /// bundle; robots report versions that can be compared.
+    /// Version of a set, of the bundle taken last; none: what the robot came with. A set calls itself by the name and
+    /// the version of its bundle; robots report versions that can be compared.
     pub fn version(&self, name: &str) -> Option<String> {
         let set = self.set(name)?;
         set.version.rsplit(' ').next().filter(|v| !v.is_empty()).map(str::to_owned)
@@ -132,13 +132,14 @@ pub trait Sets: Send {
     /// # Errors
     /// The disk's.
     fn sync(&mut self, wanted: &Wanted) -> Result<(), Error>;
-    /// Checks the whole file from the same handle that was written and makes it content. Nothing to do if it is that already.
+    /// Checks the whole file from the same handle that was written and makes it content. Nothing to do if it is that
+    /// already.
     ///
     /// # Errors
     /// [`Error::Corrupt`]: all of it is thrown away.
     fn seal(&mut self, wanted: &Wanted) -> Result<(), Error>;
-    /// Makes content of a shorter way to it that is there whole, from `base` if it is a patch, and checks it as [`Sets::seal`] does. The
-    /// shorter way goes, whatever comes of it. Nothing to do if the content is there already.
+    /// Makes content of a shorter way to it that is there whole, from `base` if it is a patch, and checks it as
+    /// [`Sets::seal`] does. The shorter way goes, whatever comes of it. Nothing to do if the content is there already.
     ///
     /// # Errors
     /// [`Error::Corrupt`] if it does not lead to what is wanted; a base that is not there; the disk's.
@@ -158,8 +159,9 @@ pub trait Sets: Send {
     /// # Errors
     /// If it is not there, or has more than `most` bytes.
     fn read(&mut self, digest: &Digest, most: u64) -> Result<Vec<u8>, Error>;
-    /// Makes a set of content that is there and reads it back. Nothing to do if it is there already. A base that lies in neither slot is
-    /// written over the spare one; if the set before needs what was there, the switch record forgets it first.
+    /// Makes a set of content that is there and reads it back. Nothing to do if it is there already. A base that lies
+    /// in neither slot is written over the spare one; if the set before needs what was there, the switch record forgets
+    /// it first.
     ///
     /// # Errors
     /// Content that is missing or not what it should be; the disk's.
@@ -180,12 +182,14 @@ pub trait Sets: Send {
     /// # Errors
     /// The disk's.
     fn discard(&mut self, wanted: &Wanted) -> Result<(), Error>;
-    /// Puts the page of a set and its files in place of what lies there, one by one, of content that is there, and reads it back.
+    /// Puts the page of a set and its files in place of what lies there, one by one, of content that is there, and
+    /// reads it back.
     ///
     /// # Errors
     /// Content that is missing; what cannot be mended so, as a base; the disk's.
     fn mend(&mut self, set: &SetManifest) -> Result<(), Error>;
-    /// The program of a set as it can be called; none: these sets are of robots in memory, which run no programs and have no data.
+    /// The program of a set as it can be called; none: these sets are of robots in memory, which run no programs and
+    /// have no data.
     fn program(&mut self, set: &Digest) -> Option<PathBuf>;
     /// Replaces the switch record. The base of a set that it makes current becomes good.
     ///

@@ -1,12 +1,13 @@
 //! Bases of sets on a disk: written to the spare slot, read back, and made good.
 //!
-//! Invariant: the good slot is never written to; a set that the switch record names is given up in the record before the slot of its base is.
+//! Invariant: the good slot is never written to; a set that the switch record names is given up in the record before
+//! the slot of its base is.
 
 use super::disk::{DiskSets, io_error, optional};
 use super::{Error, base_name};
-use crate::boot::{BOOT, Boot, Image, Slot};
 use crate::launcher::SWITCH;
-use crate::switch::{FACTORY, Switch};
+use crate::launcher::boot::{BOOT, Boot, Image, Slot};
+use crate::launcher::switch::{FACTORY, Switch};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::{COMPONENT_BYTES_MAX, Component};
 use midshift_bundle::set::SetManifest;
@@ -44,7 +45,8 @@ impl DiskSets {
         Ok(())
     }
 
-    /// Writes a base that lies whole in neither slot over the spare one: forgotten first, then written, read back, and named last.
+    /// Writes a base that lies whole in neither slot over the spare one: forgotten first, then written, read back, and
+    /// named last.
     pub(super) fn install_base(&self, set: &SetManifest) -> Result<(), Error> {
         let Some(base) = set.base() else { return Ok(()) };
         let path = self.folder.join(SWITCH);

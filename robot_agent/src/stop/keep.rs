@@ -1,7 +1,8 @@
 //! Keeps what must not be forgotten of stops, in a file of its own beside the ledger, or in memory.
 //!
-//! Invariant: what cannot be read is not taken for nothing: the robot stands until a person resumes it by a name made for that, and the broken file stays beside
-//! the new one. One writer, newest value wins. Called by the shell of the agent.
+//! Invariant: what cannot be read is not taken for nothing: the robot stands until a person resumes it by a name made
+//! for that, and the broken file stays beside the new one. One writer, newest value wins. Called by the shell of the
+//! agent.
 
 use async_trait::async_trait;
 use midshift_core::ids::{RobotId, StopId};
@@ -36,7 +37,7 @@ pub trait KeepStops: Send {
     /// What was kept. If something was and cannot be read: `unreadable`.
     async fn load(&mut self, unreadable: Kept) -> Loaded;
     /// Keeps this instead of all before. Durable when it returns.
-    async fn keep(&mut self, kept: Kept) -> Result<(), Error>;
+    async fn save(&mut self, kept: Kept) -> Result<(), Error>;
 }
 
 /// What a robot begins with that cannot read what it kept: it stands, and a person resumes it by this name.
@@ -64,7 +65,7 @@ impl KeepStops for MemoryStops {
     async fn load(&mut self, _unreadable: Kept) -> Loaded {
         Loaded { kept: self.kept(), is_durable: true }
     }
-    async fn keep(&mut self, kept: Kept) -> Result<(), Error> {
+    async fn save(&mut self, kept: Kept) -> Result<(), Error> {
         *self.lock() = kept;
         Ok(())
     }
@@ -99,8 +100,8 @@ impl KeepStops for FileStops {
     async fn load(&mut self, unreadable: Kept) -> Loaded {
         self.on_disk(move |disk| disk.load(unreadable)).await
     }
-    async fn keep(&mut self, kept: Kept) -> Result<(), Error> {
-        self.on_disk(move |disk| disk.keep(&kept)).await
+    async fn save(&mut self, kept: Kept) -> Result<(), Error> {
+        self.on_disk(move |disk| disk.save(&kept)).await
     }
 }
 
@@ -124,7 +125,8 @@ impl OnDisk {
         Ok(kept)
     }
 
-    /// Puts a new file with `first` in place of a broken one, which is copied beside. A power cut leaves the broken one or the new one.
+    /// Puts a new file with `first` in place of a broken one, which is copied beside. A power cut leaves the broken one
+    /// or the new one.
     fn replace(&self, first: &Kept) -> Result<(), Error> {
         let failed = |error: &dyn std::fmt::Display| Error(error.to_string());
         let beside = |ending: &str| self.path.with_extension(format!("latch.{ending}"));
@@ -140,7 +142,7 @@ impl OnDisk {
         midshift_durable::rename(&new, &self.path).map_err(|e| failed(&e))
     }
 
-    fn keep(&mut self, kept: &Kept) -> Result<(), Error> {
+    fn save(&mut self, kept: &Kept) -> Result<(), Error> {
         if self.file.is_none() {
             // It could not be opened at the start; what lies there counts for nothing beside what is known since.
             self.open(kept).map_err(|e| Error(e.to_string()))?;

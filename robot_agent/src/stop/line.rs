@@ -1,12 +1,14 @@
-//! The line to the stop service: a connection of its own, dialed again for as long as it takes, and the writes of what must be kept.
+//! The line to the stop service: a connection of its own, dialed again for as long as it takes, and the writes of what
+//! must be kept.
 //!
-//! Invariant: it decides nothing. Neither the session nor bulk nor the ledger can hold it up: it shares no connection, no queue and no disk write with them.
-//! Asked to move over it has the next line before it leaves this one. A message that cannot be read ends the line. Called by the shell alone.
+//! Invariant: it decides nothing. Neither the session nor bulk nor the ledger can hold it up: it shares no connection,
+//! no queue and no disk write with them. Asked to move over it has the next line before it leaves this one. A message
+//! that cannot be read ends the line. Called by the shell alone.
 
 use super::keep::{self, KeepStops, Loaded};
 use super::{CheckIn, StopNews};
-use crate::dial::{Dial, SmallCodec};
-use crate::repeats::Repeats;
+use crate::transport::dial::{Dial, SmallCodec};
+use crate::transport::repeats::Repeats;
 use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
@@ -44,15 +46,16 @@ pub struct StopLine {
 const PATH: &str = "/midshift.stop.v1.StopLinkService/Attend";
 /// Shortest and longest pause between attempts to connect, milliseconds of real time.
 const RETRY_MS: Range<u64> = 200..5_000;
-/// The longest while a line was lost, or this robot began, no longer ago than [`SOON_FOR`]: a service that is started again has its robots back before those among
-/// people stand. Each draws its pause, so that they do not come at once.
+/// The longest while a line was lost, or this robot began, no longer ago than [`SOON_FOR`]: a service that is started
+/// again has its robots back before those among people stand. Each draws its pause, so that they do not come at once.
 const RETRY_SOON_MS: u64 = 1_000;
 const SOON_FOR: Duration = Duration::from_secs(10);
 /// A refusal is given way to for so long at most: well below the time after which a robot among people stands.
 const ASKED_MS_MAX: u128 = 1_500;
 /// A line that is to move over is made again within this, milliseconds of real time.
 const SOON_MS: Range<u64> = 1..500;
-/// Messages that may wait for the wire: check-ins of three seconds and of their changes. A line that is stuck this long is given up.
+/// Messages that may wait for the wire: check-ins of three seconds and of their changes. A line that is stuck this long
+/// is given up.
 const OUTBOUND: usize = 16;
 
 /// The keeper comes back from each write, with its number.
@@ -169,7 +172,7 @@ impl Line {
                 Some(StopNews::Attended { nonce: self.rng.random::<u64>() ^ rand::random::<u64>() })
             }
             Said::Dialed(Err(NoLine { why, again_after, is_revoked })) => {
-                self.tell(robot_id, &why);
+                self.log_refusal(robot_id, &why);
                 if is_revoked {
                     self.wait(limits::REVOKED_RETRY.as_ms());
                 } else {
@@ -194,7 +197,7 @@ impl Line {
                     None
                 }
                 Err(refusal) => {
-                    self.tell(robot_id, &format!("a message cannot be read: {refusal}"));
+                    self.log_refusal(robot_id, &format!("a message cannot be read: {refusal}"));
                     self.lost("a message cannot be read")
                 }
             },
@@ -250,11 +253,11 @@ impl Line {
     }
 
     /// Writes what must be kept beside everything else.
-    pub(crate) fn keep(&mut self, number: u64, kept: &Kept) {
+    pub(crate) fn keep_stops(&mut self, number: u64, kept: &Kept) {
         let Some(mut keeper) = self.keeper.take() else { return };
         let kept = kept.clone();
         self.keeping = Some(Box::pin(async move {
-            let done = keeper.keep(kept).await;
+            let done = keeper.save(kept).await;
             (keeper, number, done)
         }));
     }
@@ -265,13 +268,14 @@ impl Line {
     }
 
     /// Says why there is no line, about once a minute: it is tried again for as long as it takes.
-    fn tell(&mut self, robot_id: &RobotId, why: &str) {
+    fn log_refusal(&mut self, robot_id: &RobotId, why: &str) {
         if let Some(times) = self.refused.count(why) {
             tracing::warn!(%robot_id, why, times, "no stop line");
         }
     }
 
-    /// Not sooner than the service asks for, but never so late that a service which turns robots away makes them stand by itself.
+    /// Not sooner than the service asks for, but never so late that a service which turns robots away makes them stand
+    /// by itself.
     fn wait_to_dial(&mut self, again_after: Option<Duration>) {
         let longest = if self.without.elapsed() < SOON_FOR { RETRY_SOON_MS } else { RETRY_MS.end };
         let most = ((2 * RETRY_MS.start) << self.failures.min(8)).min(longest);
@@ -288,8 +292,8 @@ impl Line {
     }
 }
 
-/// Who comes, and what it knows: whole as far as there is room, the most restrictive first, and the rest by name. Of more than twice as many as there may be it says
-/// nothing; it keeps them and obeys them all the same.
+/// Who comes, and what it knows: whole as far as there is room, the most restrictive first, and the rest by name. Of
+/// more than twice as many as there may be it says nothing; it keeps them and obeys them all the same.
 fn attend<'a>(robot_id: &RobotId, boot_id: &str, stops: impl Iterator<Item = &'a Stop>) -> v1::AttendRequest {
     let mut known: Vec<&Stop> = stops.collect();
     known.sort_by_key(|stop| std::cmp::Reverse(stop.level));

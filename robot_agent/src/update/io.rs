@@ -1,9 +1,10 @@
 //! Does the jobs of the updater: asks the repository, fetches bytes, makes and checks sets, writes the switch record.
 //!
-//! Invariant: it decides nothing. Bytes are believed only after the whole file was checked; what fails for a reason that may pass is
-//! [`Failure::Later`]. Called by the shell, one job at a time.
+//! Invariant: it decides nothing. Bytes are believed only after the whole file was checked; what fails for a reason
+//! that may pass is [`Failure::Later`]. Called by the shell, one job at a time.
 
-use super::{Done, Failure, Job, migrate};
+use super::jobs::{Done, Failure, Job};
+use super::migration;
 use crate::sets::{self, CHUNK_BYTES, Sets, Wanted};
 use async_trait::async_trait;
 use midshift_bundle::digest::Digest;
@@ -59,7 +60,7 @@ pub enum Way {
 }
 
 /// Whether a file of so many bytes may come by a shorter way; others come as they are.
-pub(super) fn may_come_encoded(length: u64) -> bool {
+pub(crate) fn may_come_encoded(length: u64) -> bool {
     (ENCODED_BYTES_MIN..=ENCODED_BYTES_MAX).contains(&length)
 }
 
@@ -152,7 +153,7 @@ impl Worker for UpdateWorker {
                 .unwrap_or_else(later),
             Job::Migrate { set, due } => match self.on_disk(move |sets| sets.program(&set)).await {
                 Some(program) => {
-                    migrate::call(&program, &set.to_string(), &due).await.map_or_else(Done::Failed, |()| Done::Ok)
+                    migration::call(&program, &set.to_string(), &due).await.map_or_else(Done::Failed, |()| Done::Ok)
                 }
                 None => Done::Ok,
             },
@@ -286,7 +287,8 @@ impl UpdateWorker {
         self.fetch_whole(wanted, pace, leave).await
     }
 
-    /// Whether a shorter way led to the file. One that did not is noted before anything else is tried, so that it is not tried again.
+    /// Whether a shorter way led to the file. One that did not is noted before anything else is tried, so that it is
+    /// not tried again.
     async fn fetch_shorter(
         &self,
         wanted: Wanted,

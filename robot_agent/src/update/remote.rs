@@ -1,10 +1,11 @@
 //! The server's repository over gRPC, on the bulk connection: metadata and bytes never stand before a heartbeat.
 //!
-//! Invariant: a piece is handed on only if it follows the one before and arrived as it was sent. Called by [`super::io`].
+//! Invariant: a piece is handed on only if it follows the one before and arrived as it was sent. Called by
+//! [`super::io`].
 
 use super::io::{Pieces, Remote, Way};
-use crate::bulk::{Bulk, Lease, SILENCE, silent};
 use crate::sets::Wanted;
+use crate::transport::bulk::{Bulk, Lease, SILENCE, silent};
 use async_trait::async_trait;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::trust::METADATA_BYTES_MAX;

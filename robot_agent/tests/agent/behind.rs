@@ -1,4 +1,5 @@
-//! A switch record that is older than the ledger, as when a card was put back: what was committed stays so, and nothing is told that is not.
+//! A switch record that is older than the ledger, as when a card was put back: what was committed stays so, and nothing
+//! is told that is not.
 
 use crate::rig::Rig;
 use crate::updates::{Order, connected, name_of, on_trial, state, switch, want};

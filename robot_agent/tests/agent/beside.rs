@@ -1,11 +1,12 @@
-//! A robot at work beside its own download: what it says and hears does not wait behind chunks, since they come over a connection of their own.
+//! A robot at work beside its own download: what it says and hears does not wait behind chunks, since they come over a
+//! connection of their own.
 //!
-//! On tokio's paused clock. The twin has both on one connection, where chunks that the robot does not take yet, to keep to its rate, fill the
-//! window of everything else.
+//! On tokio's paused clock. The twin has both on one connection, where chunks that the robot does not take yet, to keep
+//! to its rate, fill the window of everything else.
 
 use crate::remote::Shop;
-use crate::rig::TestBody;
 use crate::session::{Desk, Pipes, Seen, clock, config};
+use crate::test_body::TestBody;
 use async_trait::async_trait;
 use midshift_agent::body::BodyNews;
 use midshift_agent::bulk::Bulk;
@@ -88,7 +89,7 @@ async fn carry(session: &mut Seen, body: &TestBody) -> Carried {
         if carried.beats == BEATS {
             break;
         }
-        session.say(ToRobot::Downlink(Box::new(down))).await;
+        session.send(ToRobot::Downlink(Box::new(down))).await;
     }
     carried
 }
@@ -125,7 +126,7 @@ async fn beside_a_download(is_shared: bool) -> Carried {
         rate_bytes_s: RATE,
         probation_ms: 1_000,
     };
-    session.say(ToRobot::Downlink(Box::new(Downlink { update: Some(update), ..Downlink::default() }))).await;
+    session.send(ToRobot::Downlink(Box::new(Downlink { update: Some(update), ..Downlink::default() }))).await;
     let carried = carry(&mut session, &body).await;
     stop.cancel();
     agent.await.expect("no panic").expect("no error");

@@ -1,6 +1,8 @@
-//! A robot among lost messages, kills, slow disks and careless orders: what must hold after each step, whatever came before.
+//! A robot among lost messages, kills, slow disks and careless orders: what must hold after each step, whatever came
+//! before.
 
-use crate::rig::{Rig, TestBody, action, goto, place_id, point};
+use crate::rig::{Rig, action, goto, place_id, point};
+use crate::test_body::TestBody;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_agent::core::Input;
 use midshift_agent::memory::MemoryStore;
@@ -121,13 +123,13 @@ impl Judge {
             Act::Reach => {
                 if !self.rig.body.goes_to().is_empty() && !self.rig.body.log().paused {
                     self.rig.body.reach();
-                    self.rig.put(Input::Tick);
+                    self.rig.give(Input::Tick);
                 }
             }
             Act::Done => {
                 if self.rig.body.log().acting.is_some() && !self.rig.body.log().paused {
                     self.rig.body.done();
-                    self.rig.put(Input::Tick);
+                    self.rig.give(Input::Tick);
                 }
             }
             Act::Desire { epoch, fresh, grants, released, stop, suspend, held } => {
@@ -138,7 +140,7 @@ impl Judge {
                 self.rig.work(self.rig.desired(None));
             }
             Act::Reconnect => {
-                self.rig.put(Input::Disconnected);
+                self.rig.give(Input::Disconnected);
                 self.new_session();
             }
             Act::Kill => self.kill(),

@@ -114,9 +114,10 @@ fn all_agree(rig: &mut Rig, told: &UpdateReport, good: &str) {
     assert_eq!((heard.state, &heard.set), (told.state, &told.set));
 }
 
-/// What a session of the robot begins with saying of its update: heartbeats leave out what is over. It is connected then.
+/// What a session of the robot begins with saying of its update: heartbeats leave out what is over. It is connected
+/// then.
 pub fn opens_with(rig: &mut Rig) -> Option<UpdateReport> {
-    rig.put(Input::Disconnected);
+    rig.give(Input::Disconnected);
     let hello = rig.core.reported(&now_at(rig.ms));
     rig.connect();
     hello.update

@@ -1,6 +1,7 @@
 //! Drives: how far a robot goes, and on whose word.
 
-use crate::rig::{Rig, TestBody, goto, point};
+use crate::rig::{Rig, goto, point};
+use crate::test_body::TestBody;
 use midshift_agent::body::BodyNews;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_agent::memory::MemoryStore;

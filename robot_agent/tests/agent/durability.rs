@@ -1,8 +1,8 @@
-//! Judges a trace of system calls: would all that a process relies on be there if the power went? A kill cannot tell, since the kernel writes
-//! later what a killed process wrote.
+//! Judges a trace of system calls: would all that a process relies on be there if the power went? A kill cannot tell,
+//! since the kernel writes later what a killed process wrote.
 //!
-//! The disk that is thought of promises what POSIX does and no more: the bytes of a file are there once it was synced, a name once its folder
-//! was, and what was not synced may be there or not, in any order.
+//! The disk that is thought of promises what POSIX does and no more: the bytes of a file are there once it was synced,
+//! a name once its folder was, and what was not synced may be there or not, in any order.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -37,7 +37,8 @@ pub enum Event {
     Started,
 }
 
-/// The calls of a trace that did something below `root`, in order, and the starts of programs but the first, which is `strace`'s own.
+/// The calls of a trace that did something below `root`, in order, and the starts of programs but the first, which is
+/// `strace`'s own.
 pub fn events(trace: &str, root: &str) -> Vec<Event> {
     let mut calls: Vec<String> = Vec::new();
     let mut begun: BTreeMap<&str, (usize, String)> = BTreeMap::new();
@@ -190,7 +191,7 @@ impl Disk {
         let (folder, name) = split(path);
         self.unsure.entry(folder.to_owned()).or_default().insert(name.to_owned());
     }
-    fn take(&mut self, path: &str) {
+    fn remove_file(&mut self, path: &str) {
         let (folder, name) = split(path);
         self.files.remove(path);
         self.unsure.remove(path);
@@ -202,7 +203,8 @@ impl Disk {
     }
     /// Everything that was done so far must stay when `old` becomes `new`.
     fn must_stay(&mut self, what: &str, (old, new): (&str, &str)) {
-        // Bytes on their way are relied on by their marks alone, and by what they become; a database while it has no log.
+        // Bytes on their way are relied on by their marks alone, and by what they become; a database while it has no
+        // log.
         let is_marked =
             |path: &str| path.strip_suffix(".part").is_none_or(|stem| old == path || new == format!("{stem}.map"));
         let relies = |path: &str| is_marked(path) && !self.is_there(&format!("{path}-wal"));
@@ -276,7 +278,7 @@ impl Disk {
                 } else if self.undead.contains(folder) {
                     self.holes.push(format!("{path} goes: {folder} is not synced since its page went"));
                 }
-                self.take(path);
+                self.remove_file(path);
                 if path.ends_with(COPY) {
                     self.going.insert(path.clone());
                 }
@@ -305,8 +307,8 @@ impl Disk {
             self.files.iter().filter_map(|(path, file)| Some((moved(path)?, *file))).collect();
         self.files.retain(|path, _| moved(path).is_none());
         let own = self.files.get(old).copied();
-        self.take(old);
-        self.take(new);
+        self.remove_file(old);
+        self.remove_file(new);
         self.files.extend(files);
         self.files.extend(own.map(|own| (new.to_owned(), own)));
         self.give(new);
@@ -314,7 +316,8 @@ impl Disk {
     }
 }
 
-/// What would be missing if the power went at a moment when something else relies on it. `there` was on the disk before.
+/// What would be missing if the power went at a moment when something else relies on it. `there` was on the disk
+/// before.
 pub fn judge(events: &[Event], there: &BTreeSet<String>) -> Vec<String> {
     let mut disk = Disk::default();
     for path in there {

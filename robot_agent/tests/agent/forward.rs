@@ -1,4 +1,5 @@
-//! A thief of the server's keys drives the versions of the repository up, so that nothing newer could follow; its owners rotate the root.
+//! A thief of the server's keys drives the versions of the repository up, so that nothing newer could follow; its
+//! owners rotate the root.
 
 use crate::release::{Bundle, Releases};
 use crate::rig::Rig;

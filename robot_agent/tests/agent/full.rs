@@ -1,10 +1,11 @@
-//! A disk without room when the launcher puts a set away: a set that is whole is started all the same, and its agent knows which.
+//! A disk without room when the launcher puts a set away: a set that is whole is started all the same, and its agent
+//! knows which.
 
-use crate::sets::{put, set};
+use crate::sets::{put_content, set};
 use midshift_agent::launcher::{PROGRAM, SWITCH};
 use midshift_agent::sets::Sets;
 use midshift_agent::sets::disk::DiskSets;
-use midshift_agent::starts::TRIES_MAX;
+use midshift_agent::start_policy::TRIES_MAX;
 use midshift_agent::switch::{FACTORY, Fallen, Switch};
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -17,8 +18,8 @@ fn on_trial(folder: &Path) -> String {
     let mut sets = DiskSets::open(folder).expect("opens");
     let (program, settings) = (b"#!/bin/sh\nexit 1\n", b"settings");
     let set = set("v1", program, settings);
-    put(&mut sets, program);
-    put(&mut sets, settings);
+    put_content(&mut sets, program);
+    put_content(&mut sets, settings);
     sets.stage(&set).expect("stages");
     let mut switch = sets.holdings().expect("tells").switch;
     switch.try_out(&set.id().to_string());

@@ -1,5 +1,5 @@
-//! Which keys a robot takes directives of: a new one only if a release lists it and a key that was current signed it. Each test is named by
-//! what is tried.
+//! Which keys a robot takes directives of: a new one only if a release lists it and a key that was current signed it.
+//! Each test is named by what is tried.
 
 use crate::release::{Bundle, Releases};
 use crate::rig::Rig;

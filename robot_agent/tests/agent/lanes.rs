@@ -7,6 +7,7 @@ use midshift_agent::memory::MemoryStore;
 use midshift_agent::ring::{Item, Ring};
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::store::{Kept, Op, Store};
+use midshift_core::ids::AttemptId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::robot::{Lane, Mode, ReportedAttempt, Vitals};
@@ -125,28 +126,10 @@ async fn a_ring_behind_its_server_moves_on_and_loses_nothing(open: impl AsyncFn(
     assert_eq!((kept.produced, kept.samples.iter().map(|s| s.seq).collect::<Vec<_>>()), (12, vec![11, 12]));
 }
 
-async fn the_ledger_is_read_back_as_it_was_written(open: impl AsyncFn() -> Box<dyn Store>) {
-    let mut bench = Bench::new(open).await;
-    let done = attempt("T1", 4);
-    let report = AttemptReport {
-        attempt: done.clone(),
-        state: WorkState::Succeeded,
-        step_index: 2,
-        opened: true,
-        refusal: None,
-        fault: None,
-        stats: WorkStats::default(),
-    };
-    let listed = ReportedAttempt {
-        attempt: done.clone(),
-        state: WorkState::Succeeded,
-        step_index: 2,
-        progress: 9,
-        route_index: 1,
-        opened: true,
-    };
-    let holder = Holder {
-        attempt: attempt("T2", 1),
+/// An attempt that is executed.
+pub fn holder(attempt: AttemptId) -> Holder {
+    Holder {
+        attempt,
         step: 1,
         opened: true,
         intent: None,
@@ -157,7 +140,24 @@ async fn the_ledger_is_read_back_as_it_was_written(open: impl AsyncFn() -> Box<d
         base_loaded_mm: 8,
         base_energy_mwh: 9,
         hottest_joint_decidegrees: 300,
-    };
+    }
+}
+
+/// How an attempt that succeeded is answered and listed.
+pub fn succeeded(attempt: &AttemptId) -> (AttemptReport, ReportedAttempt) {
+    let (state, step_index, opened) = (WorkState::Succeeded, 2, true);
+    let stats = WorkStats::default();
+    let report =
+        AttemptReport { attempt: attempt.clone(), state, step_index, opened, refusal: None, fault: None, stats };
+    let listed = ReportedAttempt { attempt: attempt.clone(), state, step_index, progress: 9, route_index: 1, opened };
+    (report, listed)
+}
+
+async fn the_ledger_is_read_back_as_it_was_written(open: impl AsyncFn() -> Box<dyn Store>) {
+    let mut bench = Bench::new(open).await;
+    let done = attempt("T1", 4);
+    let (report, listed) = succeeded(&done);
+    let holder = holder(attempt("T2", 1));
     let places = PlacesRow {
         inside: [(place_id("door"), 3)].into(),
         committed: [(place_id("D"), 4)].into(),
@@ -277,7 +277,7 @@ fn the_heartbeat_says_what_was_written_and_ends_at_once_with_the_session() {
     rig.pass(1_500);
     let reported = rig.reported.clone().expect("a heartbeat");
     assert_eq!((reported.produced[&Lane::Event], reported.mode), (1, Mode::Manual));
-    rig.put(midshift_agent::core::Input::Disconnected);
+    rig.give(midshift_agent::core::Input::Disconnected);
     rig.messages.clear();
     rig.silence(5_000);
     assert_eq!(rig.messages.len(), 0);

@@ -21,7 +21,7 @@ use tempfile::TempDir;
 const LAUNCHER: &str = env!("CARGO_BIN_EXE_midshift-launcher");
 /// Launchers that the power may take with them before one stays: more than a set on trial has tries.
 const LAUNCHES_MAX: u32 = 6;
-/// SIGKILL.
+/// Number of SIGKILL.
 const KILL: i32 = 9;
 /// The program of every set. One that dies (`$1`) ends, or takes the power with it. Another says which set it is of; if
 /// there is a second launcher (`$3`), it says how that one ended.

@@ -1,6 +1,7 @@
 //! Offers: what a robot takes, what it refuses and what it remembers.
 
-use crate::rig::{Rig, TestBody, action, attempt, goto, point, welcome};
+use crate::rig::{Rig, action, attempt, goto, point, welcome};
+use crate::test_body::TestBody;
 use midshift_agent::body::BodyNews;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_agent::core::{ExitReason, Input};
@@ -236,9 +237,9 @@ fn work_that_cannot_be_read_ends_no_session_and_the_robot_says_so() {
 fn the_second_fence_ends_the_process() {
     let mut rig = Rig::at("A");
     rig.connect();
-    rig.put(Input::Fenced);
+    rig.give(Input::Fenced);
     assert_eq!(rig.exit, None);
     rig.connect();
-    rig.put(Input::Fenced);
+    rig.give(Input::Fenced);
     assert_eq!(rig.exit, Some(ExitReason::FencedTwice));
 }

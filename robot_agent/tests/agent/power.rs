@@ -1,18 +1,19 @@
-//! The power goes at any moment of an update, or of the way back from one: the process that makes it is killed at each of its calls that change
-//! the disk, and the launcher starts what is left.
+//! The power goes at any moment of an update, or of the way back from one: the process that makes it is killed at each
+//! of its calls that change the disk, and the launcher starts what is left.
 //!
-//! `strace` kills it as it enters the call. Without being asked a seeded sample of the calls is cut; `MIDSHIFT_SITES=all` cuts every one. A kill
-//! does not lose what was not synced: for that the trace of a whole run is judged.
+//! `strace` kills it as it enters the call. Without being asked a seeded sample of the calls is cut;
+//! `MIDSHIFT_SITES=all` cuts every one. A kill does not lose what was not synced: for that the trace of a whole run is
+//! judged.
 
 use crate::durability::{self, Event, events, judge, names};
-use crate::sets::{bytes, component, noise, patch, put, set, wanted};
+use crate::sets::{bytes, component, noise, patch, put_content, set, wanted};
 use crate::strace::{Sites, Victim, killed_at, run, sites, strace, traced};
 use midshift_agent::boot::{BASE, BOOT, Boot};
 use midshift_agent::launcher::SWITCH;
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sets::{CHUNK_BYTES, Sets};
 use midshift_agent::sqlite::SqliteStore;
-use midshift_agent::starts::TRIES_MAX;
+use midshift_agent::start_policy::TRIES_MAX;
 use midshift_agent::store::{Op, Store};
 use midshift_agent::switch::Switch;
 use midshift_agent::update::SoftwareRow;
@@ -58,7 +59,8 @@ impl Course {
         if self == Self::Update { 48 } else { 8 }
     }
 
-    /// A robot that has it before itself: v1 and v0 are committed, and v2 stands where it goes back from. What it runs without v2.
+    /// A robot that has it before itself: v1 and v0 are committed, and v2 stands where it goes back from. What it runs
+    /// without v2.
     fn begin(self, folder: &Path) -> SetManifest {
         let [_, kept] = robot(folder);
         let steps = match self {
@@ -123,7 +125,7 @@ fn robot(folder: &Path) -> [SetManifest; 2] {
         let contents = [program(version), b"settings".to_vec(), weights(number), base(number)];
         let set = set_with(version, &contents);
         for content in &contents {
-            put(&mut sets, content);
+            put_content(&mut sets, content);
         }
         sets.stage(&set).expect("stages");
         switch = sets.holdings().expect("tells").switch;
@@ -150,7 +152,8 @@ fn fetch(sets: &mut DiskSets, content: &[u8]) {
 /// Steps of a whole update beside what comes before the first and after the last: tried, proven, committed.
 const UPDATE_STEPS: usize = 3;
 
-/// An update up to so many steps, from wherever an earlier one was cut off. Each side effect is told to the ledger first.
+/// An update up to so many steps, from wherever an earlier one was cut off. Each side effect is told to the ledger
+/// first.
 fn update(folder: &Path, steps: usize, ledger: &mut dyn FnMut(&str)) {
     let mut sets = DiskSets::open(folder).expect("opens");
     let (next, contents) = next();
@@ -190,7 +193,8 @@ fn update(folder: &Path, steps: usize, ledger: &mut dyn FnMut(&str)) {
     }
 }
 
-/// The way back to the kept set, as the updater has it: read again, switched to, and what is not needed any more deleted.
+/// The way back to the kept set, as the updater has it: read again, switched to, and what is not needed any more
+/// deleted.
 fn back(folder: &Path, ledger: &mut dyn FnMut(&str)) {
     let mut sets = DiskSets::open(folder).expect("opens");
     let mut switch = sets.holdings().expect("tells").switch;
@@ -279,7 +283,8 @@ fn at<T>(test: &str, course: &str, folder: &Path, verb: impl FnOnce(&Victim<'_>)
     verb(&Victim { test: &format!("power::{test}"), environment: &environment, folder })
 }
 
-/// Cuts a course at a sample of its calls, or at all of them: what is left is started, and it ends all the same. What was cut.
+/// Cuts a course at a sample of its calls, or at all of them: what is left is started, and it ends all the same. What
+/// was cut.
 fn cut(course: Course) -> String {
     let seed = std::env::var("MIDSHIFT_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(1);
     let all = std::env::var("MIDSHIFT_SITES").is_ok_and(|sites| sites == "all");
@@ -327,7 +332,8 @@ fn wherever_the_power_goes_on_the_way_back_a_whole_set_is_started_and_the_kept_o
     }
 }
 
-/// The whole life of a robot's software, from a machine without anything: sets, switch record and boot record, each step on its ledger first.
+/// The whole life of a robot's software, from a machine without anything: sets, switch record and boot record, each
+/// step on its ledger first.
 fn live(home: &Path) {
     let (data, sets) = (home.join("robot/data"), home.join("robot/sets"));
     make_folder(&data).expect("makes");
@@ -349,8 +355,9 @@ fn live(home: &Path) {
     back(&sets, &mut ledger);
 }
 
-/// No hole is in a trace, and leaving any sync out makes one, but those in `theirs`: a database syncs as it likes; and but that of a new slot's name,
-/// which a boot record that has a copy to take away makes durable once more, and its first one does not. How many syncs.
+/// No hole is in a trace, and leaving any sync out makes one, but those in `theirs`: a database syncs as it likes; and
+/// but that of a new slot's name, which a boot record that has a copy to take away makes durable once more, and its
+/// first one does not. How many syncs.
 fn assert_durable(found: &[Event], there: &BTreeSet<String>, theirs: &str) -> usize {
     assert_eq!(judge(found, there), Vec::<String>::new());
     let is_ours = |event: &Event| matches!(event, Event::Synced(path) if !path.starts_with(theirs));

@@ -117,7 +117,8 @@ impl Releases {
         shelf.documents.insert(format!("{version}.snapshot.json"), online.snapshot);
         shelf.documents.insert("timestamp.json".to_owned(), online.timestamp);
     }
-    /// A thief of the keys `online` of snapshot and timestamp signs, with a version of his own, that this is the newest targets document.
+    /// A thief of the keys `online` of snapshot and timestamp signs, with a version of his own, that this is the newest
+    /// targets document.
     pub fn present(&self, online: (u8, u8), (number, targets): (u64, &[u8]), version: u64) {
         let mut shelf = self.shelf();
         let (snapshot, timestamp) = (key(online.0), key(online.1));
@@ -238,7 +239,8 @@ impl Releases {
         self.directive_as(bundle, generation, |directive| signed = directive.clone().sign(&key(seed)));
         String::from_utf8(signed).expect("text")
     }
-    /// A set of directive keys of these seeds, signed with the key of seed `by`, that the server holds and no release lists.
+    /// A set of directive keys of these seeds, signed with the key of seed `by`, that the server holds and no release
+    /// lists.
     pub fn hold_keys(&self, number: u64, seeds: &[u8], by: u8) -> FileTarget {
         let set = KeySet { number, keys: seeds.iter().map(|seed| key(*seed).public()).collect() };
         let held = self.hold(&set.sign(&key(by)).expect("a set"));

@@ -1,4 +1,5 @@
-//! Metadata and bytes over gRPC, from a server that the test plays, over pipes in memory on tokio's paused clock and once over TCP.
+//! Metadata and bytes over gRPC, from a server that the test plays, over pipes in memory on tokio's paused clock and
+//! once over TCP.
 
 use crate::release::{Bundle, Releases};
 use async_trait::async_trait;

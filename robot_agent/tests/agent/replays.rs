@@ -22,7 +22,7 @@ fn on_link(rig: &Rig, lane: Lane) -> Vec<u64> {
     numbers(&items(&rig.messages, lane))
 }
 
-fn of(batch: &LaneBatch) -> (u64, u64) {
+fn range_of(batch: &LaneBatch) -> (u64, u64) {
     let all = numbers(&batch.items);
     assert!(all.windows(2).all(|pair| pair[1] == pair[0] + 1), "{all:?}");
     (all[0], all[all.len() - 1])
@@ -35,14 +35,14 @@ fn beside(rig: &Rig) -> Vec<(u64, u64)> {
 
 /// Without the first ones.
 fn beside_from(rig: &Rig, at: usize) -> Vec<(u64, u64)> {
-    rig.replays[at..].iter().map(|replay| of(&replay.batch)).collect()
+    rig.replays[at..].iter().map(|replay| range_of(&replay.batch)).collect()
 }
 
 /// A robot that had no session for so long, milliseconds, and has one again.
 fn back_after(ms: u64) -> Rig {
     let mut rig = Rig::at("A");
     rig.connect();
-    rig.put(Input::Disconnected);
+    rig.give(Input::Disconnected);
     rig.silence(ms);
     rig.messages.clear();
     rig.connect();
@@ -54,7 +54,7 @@ fn produced(rig: &Rig) -> u64 {
 }
 
 fn answer(rig: &mut Rig, replayed: Replayed) {
-    rig.put(Input::Replayed(rig.epoch, replayed));
+    rig.give(Input::Replayed(rig.epoch, replayed));
 }
 
 /// The server has stored the newest batch.
@@ -71,7 +71,7 @@ fn failed() -> Replayed {
 fn after_a_break_events_come_first_then_the_live_heartbeat_and_old_status_goes_beside_the_session() {
     let mut rig = Rig::at("A");
     rig.connect();
-    rig.put(Input::Disconnected);
+    rig.give(Input::Disconnected);
     rig.messages.clear();
     rig.body.says(BodyNews::Mode(Mode::Manual));
     rig.silence(600_000);
@@ -114,7 +114,7 @@ fn batches_follow_each_other_at_the_pace_of_the_robot() {
 fn a_little_old_status_goes_on_the_session() {
     for (many, is_little) in [(limits::REPLAY_ON_LINK_MAX, true), (limits::REPLAY_ON_LINK_MAX + 1, false)] {
         let mut rig = Rig::at("A");
-        rig.put(Input::Disconnected);
+        rig.give(Input::Disconnected);
         while produced(&rig) < many as u64 {
             rig.silence(500);
         }
@@ -180,12 +180,12 @@ fn an_answer_for_the_session_before_says_nothing_and_the_next_one_begins_from_wh
     stored(&mut rig);
     rig.pass(1_000);
     let before = rig.epoch;
-    rig.put(Input::Disconnected);
-    rig.put(Input::Replayed(before, Replayed::NotServed));
+    rig.give(Input::Disconnected);
+    rig.give(Input::Replayed(before, Replayed::NotServed));
     rig.connect();
     assert_eq!(beside(&rig)[2..], [(257, 512)]);
-    rig.put(Input::Replayed(before, Replayed::NotServed));
-    rig.put(Input::Replayed(before, Replayed::Stored(ack(Lane::Status, 512))));
+    rig.give(Input::Replayed(before, Replayed::NotServed));
+    rig.give(Input::Replayed(before, Replayed::Stored(ack(Lane::Status, 512))));
     rig.pass(2_000);
     assert_eq!((rig.replays.len(), on_link(&rig, Lane::Status)), (3, vec![]), "it waits for its own answer");
     stored(&mut rig);
@@ -213,7 +213,7 @@ fn a_hole_that_the_server_saw_in_old_status_is_said() {
 #[test]
 fn a_robot_that_is_only_observed_sends_nothing_beside_its_session() {
     let mut rig = Rig::at("A");
-    rig.put(Input::Disconnected);
+    rig.give(Input::Disconnected);
     rig.silence(600_000);
     rig.connect_as(Welcome { session_epoch: 9, observed: true, ..welcome() });
     rig.pass(2_000);

@@ -31,7 +31,7 @@ fn an_intent_is_on_the_ledger_before_the_body_begins_what_must_not_be_done_twice
     // Accepted is durable, the intent is not.
     let (batch, ops) = rig.unwritten.take().expect("a batch");
     rig.store.commit_now(&ops);
-    rig.put(midshift_agent::core::Input::Persisted(batch));
+    rig.give(midshift_agent::core::Input::Persisted(batch));
     let holder = rig.store.kept().expect("loaded").ledger.holder;
     assert_eq!((rig.body.log().acts, holder.and_then(|h| h.intent)), (1, None));
     rig.flush();
@@ -83,7 +83,7 @@ fn after_a_restart_work_goes_on_only_when_the_server_has_heard_the_robot() {
     rig.connect();
     rig.work(rig.desired(Some(rig.offer("T1", 1, steps.clone(), vec![]))));
     let mut rig = rig.restart();
-    rig.put(midshift_agent::core::Input::Connected(midshift_proto::session::Welcome {
+    rig.give(midshift_agent::core::Input::Connected(midshift_proto::session::Welcome {
         session_epoch: 2,
         ..crate::rig::welcome()
     }));

@@ -1,8 +1,9 @@
-//! A robot on a bench: the core with a body that does what the test says, a store that keeps, and a server that is the test.
+//! A robot on a bench: the core with a body that does what the test says, a store that keeps, and a server that is the
+//! test.
 
 use crate::crowded::CrowdedSets;
 use crate::release::Releases;
-use midshift_agent::body::{Body, BodyLimits, BodyNews, BodyOrder, BodyState, Checked, PathPoint};
+use crate::test_body::TestBody;
 use midshift_agent::bugs::Bugs;
 use midshift_agent::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
 use midshift_agent::memory::MemoryStore;
@@ -14,7 +15,7 @@ use midshift_agent::update::io::{UpdateWorker, Worker};
 use midshift_agent::update::{Done, Failure, Job};
 use midshift_core::authority::Authority;
 use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId, WaypointId};
-use midshift_core::robot::{Fault, HardwareStop, Inventory, Lane, Load, Mode, Pose, ReportedState, StopLevel};
+use midshift_core::robot::{Lane, ReportedState};
 use midshift_core::stop::robot::Kept;
 use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
 use midshift_core::update::UpdateState;
@@ -23,198 +24,8 @@ use midshift_core::work::{
     SampleBody, StepKind, WorkState, WorkStep,
 };
 use midshift_proto::session::{ClockSample, Downlink, Echo, LaneAck, LaneBatch, StatusReplay, Uplink, Welcome};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::Arc;
 use tokio_util::sync::CancellationToken;
-
-/// What the body was told and how it is.
-#[derive(Clone)]
-pub struct BodyLog {
-    pub path: Vec<PathPoint>,
-    pub acting: Option<StepKind>,
-    pub acts: u32,
-    pub paused: bool,
-    pub stops: u32,
-    pub parks: u32,
-    pub charging: bool,
-    pub battery_permille: u16,
-    pub waypoint: Option<WaypointId>,
-    pub pose: Pose,
-    pub load: Option<Load>,
-    /// It knows its load by memory alone.
-    pub load_by_memory: bool,
-    /// Levels that it was told, in order.
-    pub levels: Vec<StopLevel>,
-    pub mode: Mode,
-    pub hardware_stop: HardwareStop,
-    pub checked: Checked,
-    /// What the maker's test finds broken.
-    pub broken: Option<Fault>,
-    news: Vec<BodyNews>,
-}
-
-#[derive(Clone)]
-pub struct TestBody(pub Arc<Mutex<BodyLog>>);
-
-impl TestBody {
-    pub fn at(name: &str) -> Self {
-        Self(Arc::new(Mutex::new(BodyLog {
-            path: Vec::new(),
-            acting: None,
-            acts: 0,
-            paused: false,
-            stops: 0,
-            parks: 0,
-            charging: false,
-            battery_permille: 700,
-            waypoint: Some(waypoint(name)),
-            pose: Pose { x_mm: x_of(name), ..Pose::default() },
-            load: None,
-            load_by_memory: false,
-            levels: Vec::new(),
-            mode: Mode::Automatic,
-            hardware_stop: HardwareStop::None,
-            checked: Checked::Unknown,
-            broken: None,
-            news: Vec::new(),
-        })))
-    }
-    fn lock(&self) -> MutexGuard<'_, BodyLog> {
-        self.0.lock().expect("not poisoned")
-    }
-    /// What it was told so far and how it is.
-    pub fn log(&self) -> BodyLog {
-        self.lock().clone()
-    }
-    /// Makes it otherwise, without a word.
-    pub fn set(&self, change: impl FnOnce(&mut BodyLog)) {
-        change(&mut self.lock());
-    }
-    /// Reaches the next point of its path, and is done if it was the last.
-    pub fn reach(&self) -> String {
-        let mut log = self.lock();
-        let point = log.path.remove(0);
-        log.waypoint = Some(point.waypoint.clone());
-        log.pose = Pose { x_mm: point.x_mm, ..Pose::default() };
-        log.news.push(BodyNews::Reached(point.waypoint.clone()));
-        if log.path.is_empty() {
-            log.news.push(BodyNews::Done);
-        }
-        point.waypoint.to_string()
-    }
-    pub fn done(&self) {
-        let mut log = self.lock();
-        log.acting = None;
-        log.news.push(BodyNews::Done);
-    }
-    pub fn says(&self, news: BodyNews) {
-        let mut log = self.lock();
-        match &news {
-            BodyNews::Mode(mode) => log.mode = *mode,
-            BodyNews::HardwareStop(stop) => log.hardware_stop = *stop,
-            BodyNews::Load(load) => log.load = load.clone(),
-            BodyNews::Failed(_) => log.acting = None,
-            _ => {}
-        }
-        log.news.push(news);
-    }
-    pub fn goes_to(&self) -> Vec<String> {
-        self.lock().path.iter().map(|p| p.waypoint.to_string()).collect()
-    }
-}
-
-impl Body for TestBody {
-    fn capabilities(&self) -> Inventory {
-        let capabilities = vec!["pick".into(), "place".into()];
-        let (model, load_by_memory) = (crate::release::MODEL.to_owned(), self.lock().load_by_memory);
-        Inventory { capabilities, model, load_by_memory, ..Inventory::default() }
-    }
-    fn limits(&self) -> BodyLimits {
-        BodyLimits { speed_mm_s: 1_500, floor_speed_mm_s: 50, battery_critical_permille: 100 }
-    }
-    fn start(&mut self, _: SiteTime, order: BodyOrder) -> Result<(), Fault> {
-        let mut log = self.lock();
-        log.paused = false;
-        match order {
-            BodyOrder::Drive(path) => log.path = path,
-            BodyOrder::Act(kind) => {
-                log.acts += 1;
-                log.acting = Some(kind);
-            }
-        }
-        Ok(())
-    }
-    fn pause(&mut self, _: SiteTime) {
-        self.lock().paused = true;
-    }
-    fn resume(&mut self, _: SiteTime) {
-        self.lock().paused = false;
-    }
-    fn obeys(&mut self, _: SiteTime, level: StopLevel) {
-        self.lock().levels.push(level);
-    }
-    fn stop(&mut self, _: SiteTime, level: StopLevel) {
-        let mut log = self.lock();
-        if level <= StopLevel::Slow {
-            return;
-        }
-        log.stops += 1;
-        log.paused = false;
-        log.path.clear();
-        log.acting = None;
-    }
-    fn standstill(&self, _: SiteTime) -> bool {
-        let log = self.lock();
-        log.paused || log.path.is_empty() && log.acting.is_none()
-    }
-    fn park(&mut self, _: SiteTime) {
-        self.lock().parks += 1;
-    }
-    fn charge(&mut self, _: SiteTime, on: bool) {
-        self.lock().charging = on;
-    }
-    fn poll(&mut self, _: SiteTime) -> Vec<BodyNews> {
-        std::mem::take(&mut self.lock().news)
-    }
-    fn next_change(&self, _: SiteTime) -> Option<SiteTime> {
-        None
-    }
-    fn state(&self, _: SiteTime) -> BodyState {
-        let log = self.lock();
-        BodyState {
-            pose: log.pose,
-            waypoint: log.waypoint.clone(),
-            speed_mm_s: 0,
-            battery_permille: log.battery_permille,
-            charging: log.charging,
-            hottest_joint_decidegrees: 300,
-            odometer_mm: 0,
-            loaded_odometer_mm: 0,
-            energy_mwh: 0,
-            field_violation: false,
-        }
-    }
-    fn load(&self) -> Option<Load> {
-        self.lock().load.clone()
-    }
-    fn forget_load(&mut self, _: SiteTime) {
-        self.says(BodyNews::Load(None));
-    }
-    fn check(&self, _: &StepKind, _: Option<&TaskId>) -> Checked {
-        self.lock().checked
-    }
-    fn self_test(&mut self, _: SiteTime) -> Result<(), Fault> {
-        self.lock().broken.clone().map_or(Ok(()), Err)
-    }
-    fn hardware_stop(&self) -> HardwareStop {
-        self.lock().hardware_stop
-    }
-    fn mode(&self) -> Mode {
-        self.lock().mode
-    }
-    fn stands_on(&self) -> Vec<WaypointId> {
-        Vec::new()
-    }
-}
 
 /// The bench.
 pub struct Rig {
@@ -281,7 +92,7 @@ pub struct Updates {
 }
 
 impl Updates {
-    pub fn of(releases: &Releases) -> Self {
+    pub fn for_releases(releases: &Releases) -> Self {
         let (releases, sets) = (releases.clone(), MemorySets::new());
         Self {
             releases,
@@ -337,7 +148,7 @@ impl Rig {
     }
     /// One with a stop line, if there is one.
     pub fn updatable_with(releases: &Releases, stop: StopDesk) -> Self {
-        let updates = Some(Updates::of(releases));
+        let updates = Some(Updates::for_releases(releases));
         Self::new(TestBody::at("A"), MemoryStore::new(), Bugs::default(), updates, START_MS, stop)
     }
     pub fn with(body: TestBody, store: MemoryStore, bugs: Bugs) -> Self {
@@ -350,7 +161,7 @@ impl Rig {
     /// One that stands at A, has a stop line and can change its software, with naive rules.
     pub fn naive(releases: &Releases, bugs: Bugs) -> Self {
         let stop = StopDesk { is_there: true, ..StopDesk::default() };
-        Self::new(TestBody::at("A"), MemoryStore::new(), bugs, Some(Updates::of(releases)), START_MS, stop)
+        Self::new(TestBody::at("A"), MemoryStore::new(), bugs, Some(Updates::for_releases(releases)), START_MS, stop)
     }
     fn new(body: TestBody, store: MemoryStore, bugs: Bugs, updates: Option<Updates>, ms: u64, stop: StopDesk) -> Self {
         let kept = store.load_now("ring-1");
@@ -381,7 +192,7 @@ impl Rig {
             generation: 100,
             heard: [0; 3],
         };
-        rig.put(Input::Start);
+        rig.give(Input::Start);
         rig
     }
     /// The process is killed and started again: what was not durable is gone.
@@ -394,7 +205,7 @@ impl Rig {
         next.epoch = self.epoch;
         next
     }
-    pub fn put(&mut self, input: Input) {
+    pub fn give(&mut self, input: Input) {
         let mut inputs = vec![input];
         while let Some(input) = inputs.pop() {
             let now = clocks_at(self.ms, self.updates.as_ref());
@@ -454,7 +265,7 @@ impl Rig {
         self.slow_disk = false;
         while let Some((batch, ops)) = self.unwritten.take() {
             self.store.commit_now(&ops);
-            self.put(Input::Persisted(batch));
+            self.give(Input::Persisted(batch));
         }
     }
     fn sent(&mut self, message: Uplink) {
@@ -484,11 +295,11 @@ impl Rig {
     }
     pub fn connect_as(&mut self, welcome: Welcome) {
         self.epoch = welcome.session_epoch;
-        self.put(Input::Connected(welcome));
+        self.give(Input::Connected(welcome));
         self.echo();
     }
     pub fn down(&mut self, down: Downlink) {
-        self.put(Input::Down(Box::new(down)));
+        self.give(Input::Down(Box::new(down)));
     }
     /// The server has processed the newest heartbeat.
     pub fn echo(&mut self) {
@@ -499,7 +310,7 @@ impl Rig {
     pub fn silence(&mut self, ms: u64) {
         for _ in 0..ms / 500 {
             self.ms += 500;
-            self.put(Input::Tick);
+            self.give(Input::Tick);
         }
     }
     /// Time passes; each heartbeat is answered.
@@ -514,18 +325,7 @@ impl Rig {
         Authority { session_epoch: self.epoch, hb: self.hb, valid_ms }
     }
     pub fn desired(&self, assignment: Option<Assignment>) -> DesiredWork {
-        DesiredWork {
-            robot_id: RobotId::parse("rbt-01").expect("a name"),
-            generation: 0,
-            assignment,
-            grants: Vec::new(),
-            held: false,
-            resume: None,
-            closed: Vec::new(),
-            maintenance: None,
-            resumed: Vec::new(),
-            load_word: None,
-        }
+        desired(assignment)
     }
     /// Sends desired work with the next generation.
     pub fn work(&mut self, work: DesiredWork) {
@@ -579,6 +379,22 @@ impl Rig {
     }
     pub fn stale(&self) -> usize {
         self.events.iter().filter(|e| matches!(e, RobotEvent::StaleAuthority { .. })).count()
+    }
+}
+
+/// Desired work of generation 0 with this assignment, and nothing else.
+pub fn desired(assignment: Option<Assignment>) -> DesiredWork {
+    DesiredWork {
+        robot_id: RobotId::parse("rbt-01").expect("a name"),
+        generation: 0,
+        assignment,
+        grants: Vec::new(),
+        held: false,
+        resume: None,
+        closed: Vec::new(),
+        maintenance: None,
+        resumed: Vec::new(),
+        load_word: None,
     }
 }
 

@@ -1,7 +1,8 @@
 //! The shell against a server that the test plays, over pipes in memory and on tokio's paused clock.
 
 use crate::release::{Releases, component};
-use crate::rig::{TestBody, attempt, goto, point, waypoint, welcome};
+use crate::rig::{attempt, desired, goto, point, waypoint, welcome};
+use crate::test_body::TestBody;
 use async_trait::async_trait;
 use hyper_util::rt::TokioIo;
 use midshift_agent::body::BodyNews;
@@ -76,7 +77,7 @@ impl Seen {
             if let Some(heartbeat) = self.uplink().await.heartbeat {
                 let hb = heartbeat.reported.hb;
                 let echo = Some(Echo { hb, clock: ClockSample::default(), is_clock_doubted: false });
-                self.say(ToRobot::Downlink(Box::new(Downlink { echo, ..Downlink::default() }))).await;
+                self.send(ToRobot::Downlink(Box::new(Downlink { echo, ..Downlink::default() }))).await;
                 return hb;
             }
         }
@@ -94,7 +95,7 @@ impl Seen {
             }
         }
     }
-    pub async fn say(&self, message: ToRobot) {
+    pub async fn send(&self, message: ToRobot) {
         self.down.send(Ok(v1::SessionResponse::from(&message))).await.expect("the robot listens");
     }
     pub async fn welcome(&self, session_epoch: u64) {
@@ -102,10 +103,10 @@ impl Seen {
     }
     async fn welcome_as(&self, session_epoch: u64, observed: bool) {
         let session_secret = format!("s{session_epoch}").into();
-        self.say(ToRobot::Welcome(Welcome { session_epoch, session_secret, observed, ..welcome() })).await;
+        self.send(ToRobot::Welcome(Welcome { session_epoch, session_secret, observed, ..welcome() })).await;
     }
     async fn close(&self, code: CloseCode) {
-        self.say(ToRobot::Close(Close { code, reason: Code::Fenced.into(), retry_after_ms: 0 })).await;
+        self.send(ToRobot::Close(Close { code, reason: Code::Fenced.into(), retry_after_ms: 0 })).await;
     }
 }
 
@@ -346,7 +347,7 @@ async fn asked_to_move_over_it_opens_the_next_session_before_the_old_one_closes(
     old.hello().await;
     old.welcome(5).await;
     old.beat().await;
-    old.say(ToRobot::MoveOver { within_ms: 30_000 }).await;
+    old.send(ToRobot::MoveOver { within_ms: 30_000 }).await;
     let mut next = bench.session().await;
     next.hello().await;
     // Meanwhile the old one lives.
@@ -411,19 +412,8 @@ async fn a_robot_on_its_file_takes_work_over_the_wire_and_does_it() {
         suspend: false,
         speed_limit_mm_s: None,
     };
-    let work = DesiredWork {
-        robot_id: RobotId::parse("rbt-01").expect("a name"),
-        generation: 1,
-        assignment: Some(assignment),
-        grants: Vec::new(),
-        held: false,
-        resume: None,
-        closed: Vec::new(),
-        maintenance: None,
-        resumed: Vec::new(),
-        load_word: None,
-    };
-    session.say(ToRobot::Downlink(Box::new(Downlink { work: Some(work), ..Downlink::default() }))).await;
+    let work = DesiredWork { generation: 1, ..desired(Some(assignment)) };
+    session.send(ToRobot::Downlink(Box::new(Downlink { work: Some(work), ..Downlink::default() }))).await;
     let mut states = Vec::new();
     while states.last() != Some(&WorkState::Succeeded) {
         let RobotEvent::Attempt(report) = session.event().await else { continue };

@@ -32,7 +32,8 @@ impl Place {
             Self::Memory(sets) => Box::new(sets.clone()),
         }
     }
-    /// The power goes. A disk keeps what was written and not synced or not, as it likes; marks it keeps only if they were synced.
+    /// The power goes. A disk keeps what was written and not synced or not, as it likes; marks it keeps only if they
+    /// were synced.
     fn cut(&self, sets: Box<dyn Sets>) -> Box<dyn Sets> {
         drop(sets);
         if let Self::Memory(sets) = self {
@@ -89,7 +90,7 @@ pub fn wanted(content: &[u8]) -> Wanted {
     Wanted { digest: Digest::of(content), length: content.len() as u64 }
 }
 
-pub fn put(sets: &mut dyn Sets, content: &[u8]) -> Wanted {
+pub fn put_content(sets: &mut dyn Sets, content: &[u8]) -> Wanted {
     let wanted = wanted(content);
     for range in sets.missing(&wanted).expect("tells") {
         let part = &content[range.start as usize..range.end as usize];
@@ -116,8 +117,8 @@ pub fn set(version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
 
 fn staged(sets: &mut dyn Sets, version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
     let set = set(version, program, settings);
-    put(sets, program);
-    put(sets, settings);
+    put_content(sets, program);
+    put_content(sets, settings);
     sets.stage(&set).expect("stages");
     set
 }
@@ -138,7 +139,7 @@ fn a_download_goes_on_after_a_power_cut_where_it_was_durable() {
             only(2 * CHUNK_BYTES..wanted.length),
             "the last was not synced"
         );
-        put(&mut *sets, &content);
+        put_content(&mut *sets, &content);
         assert_eq!(sets.missing(&wanted).expect("tells"), []);
         assert_eq!(sets.read(&wanted.digest, wanted.length).expect("reads"), content);
         assert!(sets.read(&wanted.digest, 10).is_err(), "longer than it may be");
@@ -169,7 +170,7 @@ fn bytes_that_are_not_what_they_should_be_are_thrown_away_whole() {
         assert_eq!(sets.missing(&wanted).expect("tells"), only(0..wanted.length));
         sets.write(&wanted, 0, &content[..CHUNK_BYTES as usize]).expect("writes");
         assert!(matches!(sets.seal(&wanted), Err(Error::Corrupt { .. })), "its end is missing");
-        put(&mut *sets, &content);
+        put_content(&mut *sets, &content);
     }
 }
 
@@ -190,7 +191,7 @@ fn a_set_is_made_of_content_that_is_there_and_read_back() {
     for place in Place::both() {
         let mut sets = place.open();
         let incomplete = set("v1", b"program", b"settings");
-        put(&mut *sets, b"program");
+        put_content(&mut *sets, b"program");
         assert!(matches!(sets.stage(&incomplete), Err(Error::Missing(_))));
         assert_eq!(sets.holdings().expect("tells").sets, BTreeMap::new());
         let whole = staged(&mut *sets, "v1", b"program", b"settings");
@@ -211,7 +212,7 @@ fn a_set_whose_bytes_changed_on_the_disk_is_found_out_and_can_come_again() {
         place.rot(&Digest::of(b"settings"));
         assert!(matches!(sets.verify(&set.id()), Err(Error::Corrupt { .. })));
         assert!(matches!(sets.stage(&set), Err(Error::Corrupt { .. })));
-        put(&mut *sets, b"settings");
+        put_content(&mut *sets, b"settings");
         sets.stage(&set).expect("stages");
     }
 }
@@ -305,7 +306,7 @@ fn a_file_that_was_changed_is_found_thrown_away_and_put_in_place_anew() {
         sets.discard(&wanted(settings)).expect("is right");
         sets.discard(&wanted(program)).expect("goes");
         assert!(sets.mend(&set).is_err(), "its content is not there");
-        assert_eq!(put(&mut *sets, program).digest, gait.digest);
+        assert_eq!(put_content(&mut *sets, program).digest, gait.digest);
         sets.mend(&set).expect("mends");
         files.iter().for_each(|file| sets.check(&id, file).expect("is whole"));
         sets.mend(&set).expect("nothing to do");
@@ -408,8 +409,8 @@ fn content_is_made_of_a_patch_and_what_is_there_and_stays_after_a_power_cut() {
     for place in Place::both() {
         let mut sets = place.open();
         let (old, new) = (noise(1, 300_000), [noise(2, 77), noise(1, 300_000)].concat());
-        let base = put(&mut *sets, &old);
-        let encoded = put(&mut *sets, &patch(&old, &new));
+        let base = put_content(&mut *sets, &old);
+        let encoded = put_content(&mut *sets, &patch(&old, &new));
         let new_one = wanted(&new);
         assert_eq!(sets.missing(&new_one).expect("tells"), only(0..new_one.length));
         sets.decode(&new_one, Some(&base.digest), &encoded).expect("leads there");
@@ -429,7 +430,7 @@ fn a_way_that_leads_elsewhere_makes_no_content_and_goes() {
         let mut tampered = right.clone();
         tampered[100] ^= 4;
         let mut sets = place.open();
-        let [base, other] = [&old, &noise(5, 300_000)].map(|content| put(&mut *sets, content).digest);
+        let [base, other] = [&old, &noise(5, 300_000)].map(|content| put_content(&mut *sets, content).digest);
         let cases = [
             (tampered, Some(base), new_one),
             (right.clone(), Some(other), new_one),
@@ -440,13 +441,13 @@ fn a_way_that_leads_elsewhere_makes_no_content_and_goes() {
             (bomb(), None, new_one),
         ];
         for (way, base, wanted) in cases {
-            let encoded = put(&mut *sets, &way);
+            let encoded = put_content(&mut *sets, &way);
             let made = sets.decode(&wanted, base.as_ref(), &encoded);
             assert!(matches!(made, Err(Error::Corrupt { digest }) if digest == wanted.digest), "{made:?}");
             assert_eq!(sets.missing(&wanted).expect("tells"), only(0..wanted.length));
             assert!(sets.read(&encoded.digest, encoded.length).is_err(), "the way went");
         }
-        let encoded = put(&mut *sets, &patch(&old, &new));
+        let encoded = put_content(&mut *sets, &patch(&old, &new));
         let nothing = Digest::of(b"of nobody");
         assert!(
             matches!(sets.decode(&new_one, Some(&nothing), &encoded), Err(Error::Missing(digest)) if digest == nothing)
@@ -466,7 +467,7 @@ fn that_a_file_comes_as_it_is_is_remembered_until_it_is_there() {
         assert!(sets.is_fetched_as_it_is(&file).expect("tells"));
         sets.collect(&BTreeSet::from([file.digest])).expect("collects");
         assert!(sets.is_fetched_as_it_is(&file).expect("tells"), "it is still wanted");
-        put(&mut *sets, &content);
+        put_content(&mut *sets, &content);
         sets.collect(&BTreeSet::from([file.digest])).expect("collects");
         assert!(!sets.is_fetched_as_it_is(&file).expect("tells"));
     }
@@ -478,7 +479,7 @@ pub fn based(sets: &mut dyn Sets, version: &str, base: &[u8]) -> SetManifest {
     let os = component("os", ComponentKind::Base, base);
     set.components.insert(os.name.clone(), os);
     for content in [&b"program"[..], b"settings", base] {
-        put(sets, content);
+        put_content(sets, content);
     }
     sets.stage(&set).expect("stages");
     set

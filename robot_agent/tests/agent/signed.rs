@@ -1,16 +1,17 @@
-//! What runs is what was signed and committed: held against its documents at each start and while it runs, and what follows if it is not.
+//! What runs is what was signed and committed: held against its documents at each start and while it runs, and what
+//! follows if it is not.
 
 use crate::release::{Bundle, Releases};
 use crate::rig::{Rig, action};
-use crate::sets::{put, set};
+use crate::sets::{put_content, set};
 use crate::updates::{Order, committed, connected, name_of, on_trial, relaunch, stage, state, switch, want, why};
 use midshift_agent::core::ExitReason;
 use midshift_agent::memory::MemoryStore;
 use midshift_agent::sets::Sets;
 use midshift_agent::sets::memory::MemorySets;
+use midshift_agent::storage::Proven;
 use midshift_agent::store::Op;
 use midshift_agent::switch::{FACTORY, Switch};
-use midshift_agent::update::proven::Proven;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::Migration;
 use midshift_core::reason::Code;
@@ -55,8 +56,8 @@ fn forged(rig: &Rig) -> String {
 fn forged_and(rig: &Rig, change: impl FnOnce(&mut Switch)) -> String {
     let mut sets = disk(rig);
     let forged = set("6.6.6", b"forged program", b"forged settings");
-    put(&mut sets, b"forged program");
-    put(&mut sets, b"forged settings");
+    put_content(&mut sets, b"forged program");
+    put_content(&mut sets, b"forged settings");
     sets.stage(&forged).expect("stages");
     let mut switch = sets.holdings().expect("tells").switch;
     switch.try_out(&forged.id().to_string());

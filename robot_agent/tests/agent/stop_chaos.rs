@@ -1,7 +1,8 @@
-//! Stops, resets, resumes, permissions, silences and kills in any order: the body never moves before all that let it go on.
+//! Stops, resets, resumes, permissions, silences and kills in any order: the body never moves before all that let it go
+//! on.
 
 use crate::rig::{Rig, goto, point};
-use crate::stops::{attend, free, hear, moves, reset, serve, stop, stop_id, told};
+use crate::stops::{attend, free, hear_news, moves, reset, serve, stop, stop_id, told};
 use midshift_agent::stop::StopNews;
 use midshift_core::robot::StopLevel;
 use midshift_core::work::{Assignment, DesiredWork};
@@ -81,10 +82,11 @@ impl Judge {
                 self.rig.work(work);
             }
             Act::Line => attend(&mut self.rig),
-            Act::LineLost => hear(&mut self.rig, StopNews::LineLost),
+            Act::LineLost => hear_news(&mut self.rig, StopNews::LineLost),
             Act::Pass => serve(&mut self.rig, 4_000),
             Act::Kill => {
-                // One that waits for nobody any more is held by fleet's own word until it is permitted, and nobody says it here.
+                // One that waits for nobody any more is held by fleet's own word until it is permitted, and nobody says
+                // it here.
                 self.is_permitted |= self.stood.iter().all(|n| self.reset.contains(n) && self.resumed.contains(n));
                 let rig = std::mem::replace(&mut self.rig, Rig::at("A"));
                 self.rig = rig.restart();

@@ -1,6 +1,7 @@
 //! The file of a robot's stops through the life of an agent that is killed at any of its calls that change the disk.
 //!
-//! Without being asked a seeded sample of the calls is cut; `MIDSHIFT_SITES=all` cuts every one. A write of which half arrives is the latch file's own test.
+//! Without being asked a seeded sample of the calls is cut; `MIDSHIFT_SITES=all` cuts every one. A write of which half
+//! arrives is the latch file's own test.
 
 #![expect(clippy::print_stdout, reason = "the one that is killed says what it has done")]
 
@@ -74,7 +75,7 @@ fn all_news() -> Vec<News> {
 }
 
 /// One robot that hears; whether there is something to keep.
-fn hear(robot: &mut RobotStop, news: &News) -> bool {
+fn hear_news(robot: &mut RobotStop, news: &News) -> bool {
     let now = Now { link: LinkTime(10), site: SiteTime(10), utc: Utc(1_000), wall: Utc(1_000), jump: None };
     let is_new = match news {
         News::Told(stops, resets) => robot.told(stops.clone(), resets.clone()),
@@ -95,7 +96,7 @@ fn begun(kept: Kept) -> RobotStop {
 fn states(first: Kept) -> Vec<Kept> {
     let (mut robot, mut states) = (begun(first.clone()), vec![first]);
     for news in all_news() {
-        if hear(&mut robot, &news) {
+        if hear_news(&mut robot, &news) {
             states.push(robot.kept().clone());
         }
     }
@@ -130,8 +131,8 @@ fn live(folder: &Path) {
             (file, loaded) = load(folder);
             assert_eq!(loaded, Loaded { kept: robot.kept().clone(), is_durable: true });
         }
-        if hear(&mut robot, &news) {
-            wait(file.keep(robot.kept().clone())).expect("keeps");
+        if hear_news(&mut robot, &news) {
+            wait(file.save(robot.kept().clone())).expect("keeps");
             println!("+{}", serde_json::to_string(robot.kept()).expect("JSON"));
         }
     }
@@ -198,10 +199,10 @@ fn cut(is_broken: bool) -> usize {
         // Said once more it comes to the same, and the facts do so in any order.
         let (mut again, mut backwards) = (begun(loaded.kept.clone()), begun(loaded.kept));
         for news in all_news() {
-            hear(&mut again, &news);
+            hear_news(&mut again, &news);
         }
         for news in all_news().iter().rev() {
-            hear(&mut backwards, news);
+            hear_news(&mut backwards, news);
         }
         assert_eq!(again.kept(), last, "{when}");
         assert_eq!(backwards.kept().latch, last.latch, "{when}");

@@ -1,8 +1,9 @@
-//! The line to the stop service, over pipes in memory and tokio's paused clock, and over loopback; and the file of stops.
+//! The line to the stop service, over pipes in memory and tokio's paused clock, and over loopback; and the file of
+//! stops.
 
-use crate::rig::TestBody;
 use crate::session::{Pipes, clock, config};
 use crate::stops::{reset, stop, stop_id};
+use crate::test_body::TestBody;
 use async_trait::async_trait;
 use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
@@ -57,19 +58,19 @@ impl Seen {
             other => panic!("no check-in: {other:?}"),
         }
     }
-    async fn say(&self, message: v1::attend_response::Message) {
+    async fn send(&self, message: v1::attend_response::Message) {
         self.down.send(Ok(v1::AttendResponse { message: Some(message) })).await.expect("the robot listens");
     }
-    async fn tell(&self, stops: &[Stop], generation: u64) {
+    async fn tell_stops(&self, stops: &[Stop], generation: u64) {
         let stops = stops.iter().map(Into::into).collect();
-        self.say(v1::attend_response::Message::Told(v1::Told { stops, resets: vec![], generation })).await;
+        self.send(v1::attend_response::Message::Told(v1::Told { stops, resets: vec![], generation })).await;
     }
     async fn synced(&self, generation: u64) {
-        self.say(v1::attend_response::Message::Synced(v1::Synced { generation, ..Default::default() })).await;
+        self.send(v1::attend_response::Message::Synced(v1::Synced { generation, ..Default::default() })).await;
     }
     async fn answer(&self, check_in: &v1::CheckIn, generation: u64) {
         let nonce = check_in.nonce;
-        self.say(v1::attend_response::Message::CheckedIn(v1::CheckedIn { nonce, generation })).await;
+        self.send(v1::attend_response::Message::CheckedIn(v1::CheckedIn { nonce, generation })).await;
     }
     /// Check-ins are answered until one is as it should be.
     async fn until(&mut self, generation: u64, is_it: impl Fn(&v1::CheckIn) -> bool) -> v1::CheckIn {
@@ -197,7 +198,7 @@ async fn it_attends_is_told_and_checks_in_each_second_with_numbers_that_never_co
     let seconds = begin.elapsed().as_secs_f64();
     assert!((7.0..11.0).contains(&seconds), "ten check-ins, some at once with a change, took {seconds} s");
     let stopped = Instant::now();
-    line.tell(&[stop(1, StopLevel::Halt)], 2).await;
+    line.tell_stops(&[stop(1, StopLevel::Halt)], 2).await;
     let said = line.until(2, |c| c.generation == 2).await;
     assert_eq!((said.obeys, said.inside), (HALT, vec!["STOP-1".to_owned()]));
     assert!(stopped.elapsed() < Duration::from_millis(20), "at once");
@@ -216,7 +217,7 @@ async fn a_ledger_whose_disk_hangs_and_a_link_that_is_not_there_do_not_hold_a_st
     let mut bench = Bench::with(Box::new(Hung(MemoryStore::new())), Box::new(MemoryStops::default()));
     let mut line = bench.free().await;
     assert_eq!(bench.body.log().levels.last(), Some(&StopLevel::None));
-    line.tell(&[stop(1, StopLevel::Halt)], 2).await;
+    line.tell_stops(&[stop(1, StopLevel::Halt)], 2).await;
     line.until(2, |c| c.obeys == HALT && c.standstill && c.durable).await;
     assert_eq!(bench.body.log().levels.last(), Some(&StopLevel::Halt));
     bench.agent.abort();
@@ -230,7 +231,7 @@ impl KeepStops for HungStops {
     async fn load(&mut self, _: Kept) -> Loaded {
         Loaded { kept: Kept::default(), is_durable: true }
     }
-    async fn keep(&mut self, _: Kept) -> Result<(), midshift_agent::stop::keep::Error> {
+    async fn save(&mut self, _: Kept) -> Result<(), midshift_agent::stop::keep::Error> {
         std::future::pending().await
     }
 }
@@ -239,7 +240,7 @@ impl KeepStops for HungStops {
 async fn a_file_of_stops_whose_disk_hangs_holds_nothing_up_either_and_that_is_said() {
     let mut bench = Bench::with(Box::new(MemoryStore::new()), Box::new(HungStops));
     let mut line = bench.free().await;
-    line.tell(&[stop(1, StopLevel::Halt)], 2).await;
+    line.tell_stops(&[stop(1, StopLevel::Halt)], 2).await;
     let said = line.until(2, |c| c.obeys == HALT).await;
     assert!(said.standstill && !said.durable);
     bench.end().await;
@@ -349,9 +350,9 @@ async fn stops_that_find_no_room_are_brought_by_name_and_their_resets_reach_it()
     let large = |n: u64| Stop { scope: hall.clone(), region: region.clone(), ..stop(n, StopLevel::Slow) };
     let all: Vec<Stop> = (0..200).map(large).collect();
     for some in all.chunks(10) {
-        line.tell(some, 0).await;
+        line.tell_stops(some, 0).await;
     }
-    line.tell(&[Stop { level: StopLevel::Halt, ..large(250) }], 0).await;
+    line.tell_stops(&[Stop { level: StopLevel::Halt, ..large(250) }], 0).await;
     line.synced(1).await;
     line.until(1, |c| c.durable).await;
     drop(line);
@@ -371,7 +372,7 @@ async fn stops_that_find_no_room_are_brought_by_name_and_their_resets_reach_it()
 async fn asked_to_move_over_it_has_the_next_line_before_it_leaves_this_one() {
     let mut bench = Bench::new();
     let mut old = bench.free().await;
-    old.say(v1::attend_response::Message::MoveOver(v1::MoveOver {})).await;
+    old.send(v1::attend_response::Message::MoveOver(v1::MoveOver {})).await;
     let mut next = loop {
         tokio::select! {
             biased;
@@ -391,9 +392,9 @@ async fn asked_to_move_over_it_has_the_next_line_before_it_leaves_this_one() {
 async fn a_message_that_cannot_be_read_ends_the_line_and_what_was_told_before_stands() {
     let mut bench = Bench::new();
     let mut line = bench.free().await;
-    line.tell(&[stop(1, StopLevel::Halt)], 2).await;
+    line.tell_stops(&[stop(1, StopLevel::Halt)], 2).await;
     line.until(2, |c| c.obeys == HALT).await;
-    line.say(v1::attend_response::Message::Told(v1::Told {
+    line.send(v1::attend_response::Message::Told(v1::Told {
         stops: vec![v1::Stop::default()],
         resets: vec![],
         generation: 3,
@@ -442,7 +443,7 @@ async fn over_loopback_an_engaged_stop_is_kept_in_its_file_and_stands_the_robot_
     };
     let mut bench = begin(lines);
     let mut line = bench.free().await;
-    line.tell(&[stop(1, StopLevel::Halt)], 2).await;
+    line.tell_stops(&[stop(1, StopLevel::Halt)], 2).await;
     let said = line.until(2, |c| c.obeys == HALT && c.durable).await;
     assert_eq!(said.awaiting_resume, ["STOP-1"]);
     bench.agent.abort();
@@ -481,7 +482,7 @@ async fn a_file_that_cannot_be_read_stands_the_robot_until_a_person_resumes_that
     std::fs::create_dir(&odd).expect("makes");
     let mut stops = FileStops::new(&odd);
     assert_eq!(stops.load(first.clone()).await, Loaded { kept: first.clone(), is_durable: false });
-    assert!(stops.keep(first).await.is_err());
+    assert!(stops.save(first).await.is_err());
 }
 
 #[tokio::test]
@@ -497,7 +498,7 @@ async fn more_resets_than_the_file_holds_give_way_to_stops() {
     }
     kept.latch.engage(stop(9_999, StopLevel::Halt));
     kept.awaiting = [stop_id(3), stop_id(9_999)].into();
-    stops.keep(kept.clone()).await.expect("keeps");
+    stops.save(kept.clone()).await.expect("keeps");
     drop(stops);
     let loaded = FileStops::new(&path).load(Kept::default()).await;
     assert!(loaded.is_durable);

@@ -1,4 +1,5 @@
-//! Fleet stop and software: nothing is activated while a robot is stopped, and going back stays possible where it stands.
+//! Fleet stop and software: nothing is activated while a robot is stopped, and going back stays possible where it
+//! stands.
 
 use crate::release::Releases;
 use crate::rig::{Rig, action};

@@ -1,15 +1,15 @@
-//! Fleet stop: what a robot does about stops and about their silence, and what lets it go on. The link's server and the stop service are the test.
+//! Fleet stop: what a robot does about stops and about their silence, and what lets it go on. The link's server and the
+//! stop service are the test.
 
 use crate::rig::{Rig, StopDesk, action, goto, point};
 use midshift_agent::core::Input;
 use midshift_agent::stop::{CheckIn, StopNews};
 use midshift_core::ids::{AreaId, RobotId, StopId};
-use midshift_core::policy::AreaPolicy;
 use midshift_core::robot::{Load, Pose, StopLevel};
 use midshift_core::stop::ladder::Stage;
 use midshift_core::stop::{Region, Reset, Scope, Stop};
 use midshift_core::time::Utc;
-use midshift_core::work::{Assignment, DesiredPolicy, DesiredWork, Effect, RobotEvent, WorkState, WorkStep};
+use midshift_core::work::{Assignment, DesiredWork, Effect, RobotEvent, WorkState, WorkStep};
 use midshift_proto::session::Downlink;
 use std::collections::BTreeSet;
 
@@ -27,31 +27,31 @@ pub fn reset(n: u64) -> Reset {
 }
 
 /// Generation of the latch with the `n`-th message.
-const SYNCED: u64 = 10;
+pub const SYNCED: u64 = 10;
 
 pub fn desk() -> StopDesk {
     StopDesk { is_there: true, ..StopDesk::default() }
 }
 
-pub fn hear(rig: &mut Rig, news: StopNews) {
-    rig.put(Input::Stop(Box::new(news)));
+pub fn hear_news(rig: &mut Rig, news: StopNews) {
+    rig.give(Input::Stop(Box::new(news)));
 }
 
 pub fn told(rig: &mut Rig, stops: Vec<Stop>, resets: Vec<Reset>) {
-    hear(rig, StopNews::Told { stops, resets, generation: SYNCED });
+    hear_news(rig, StopNews::Told { stops, resets, generation: SYNCED });
 }
 
 /// A line opens, and nothing is effective.
 pub fn attend(rig: &mut Rig) {
     let nonce = rig.ms * 1_000;
-    hear(rig, StopNews::Attended { nonce });
-    hear(rig, StopNews::Synced { generation: SYNCED, key: Vec::new() });
+    hear_news(rig, StopNews::Attended { nonce });
+    hear_news(rig, StopNews::Synced { generation: SYNCED, key: Vec::new() });
 }
 
 /// Every check-in that waits is answered.
-fn answer(rig: &mut Rig) {
+pub fn answer(rig: &mut Rig) {
     for (nonce, said) in std::mem::take(&mut rig.stop.check_ins) {
-        hear(rig, StopNews::CheckedIn { nonce, generation: said.generation });
+        hear_news(rig, StopNews::CheckedIn { nonce, generation: said.generation });
     }
 }
 
@@ -65,7 +65,7 @@ pub fn serve(rig: &mut Rig, ms: u64) {
 }
 
 /// Time passes; the link's server answers and the stop service is silent.
-fn stop_silence(rig: &mut Rig, ms: u64) {
+pub fn stop_silence(rig: &mut Rig, ms: u64) {
     for _ in 0..ms / 500 {
         rig.pass(500);
         rig.stop.check_ins.clear();
@@ -82,7 +82,7 @@ pub fn awaiting(rig: &Rig) -> Vec<String> {
     rig.core.reported(&at).awaiting_resume.iter().map(ToString::to_string).collect()
 }
 
-fn said(rig: &Rig) -> CheckIn {
+pub fn said(rig: &Rig) -> CheckIn {
     rig.stop.check_ins.last().expect("it said something").1.clone()
 }
 
@@ -105,7 +105,7 @@ fn to_c(rig: &Rig) -> Assignment {
 }
 
 /// Drives to C over B.
-fn driving() -> Rig {
+pub fn driving() -> Rig {
     let mut rig = free();
     rig.work(rig.desired(Some(to_c(&rig))));
     assert_eq!((rig.body.goes_to().len(), rig.body.log().paused), (2, false));
@@ -119,12 +119,12 @@ pub fn moves(rig: &Rig) -> bool {
     !log.paused && (!log.path.is_empty() || log.acting.is_some())
 }
 
-fn speeds(rig: &Rig) -> Vec<u32> {
+pub fn speeds(rig: &Rig) -> Vec<u32> {
     rig.body.log().path.iter().map(|p| p.speed_mm_s).collect()
 }
 
 /// What people resumed and whether there is a fresh permission to go on.
-fn resume(rig: &mut Rig, resumed: &[StopId], is_permitted: bool) {
+pub fn resume(rig: &mut Rig, resumed: &[StopId], is_permitted: bool) {
     let resume = is_permitted.then(|| rig.authority(10_000));
     let order = rig.core.kept().ledger.holder.is_some().then(|| to_c(rig));
     rig.work(DesiredWork { resumed: resumed.to_vec(), resume, ..rig.desired(order) });
@@ -199,7 +199,7 @@ fn in_whatever_order_and_however_often_it_is_told_it_obeys_the_same() {
         |rig| told(rig, vec![stop(1, StopLevel::Halt)], vec![]),
         |rig| told(rig, vec![], vec![reset(1)]),
         |rig| told(rig, vec![stop(2, StopLevel::Halt)], vec![]),
-        |rig| hear(rig, StopNews::Synced { generation: SYNCED, key: Vec::new() }),
+        |rig| hear_news(rig, StopNews::Synced { generation: SYNCED, key: Vec::new() }),
     ];
     let mut orders = 0;
     for order in 0..256 {
@@ -374,7 +374,7 @@ fn a_robot_that_starts_stands_until_it_was_told_and_answered() {
     assert_eq!(level(&rig), StopLevel::Halt, "no line");
     rig.work(rig.desired(Some(to_c(&rig))));
     assert_eq!((rig.refusals(), moves(&rig)), (vec!["ROBOT_STOPPED".into()], false));
-    hear(&mut rig, StopNews::Attended { nonce: 5 });
+    hear_news(&mut rig, StopNews::Attended { nonce: 5 });
     serve(&mut rig, 5_000);
     assert_eq!(level(&rig), StopLevel::Halt, "answered, and not told");
     let mut rig = Rig::stoppable("A", desk());
@@ -399,140 +399,6 @@ fn work_that_was_under_way_at_a_restart_goes_on_without_a_resume_if_nobody_stopp
     attend(&mut rig);
     serve(&mut rig, 4_000);
     assert!(moves(&rig));
-}
-
-#[test]
-fn a_service_that_reads_and_never_answers_slows_and_stands_the_robot_and_is_dialed_again() {
-    let mut rig = driving();
-    stop_silence(&mut rig, 2_000);
-    assert_eq!((level(&rig), moves(&rig)), (StopLevel::None, true));
-    stop_silence(&mut rig, 2_000);
-    assert_eq!((level(&rig), speeds(&rig)), (StopLevel::Slow, vec![300, 300]));
-    assert_eq!(rig.stop.redials, ["no answer"]);
-    // Others are dialed, and hang as it did.
-    for _ in 0..3 {
-        attend(&mut rig);
-        stop_silence(&mut rig, 1_000);
-    }
-    assert_eq!((level(&rig), moves(&rig)), (StopLevel::ControlledStopPosture, false));
-}
-
-#[test]
-fn answers_that_lay_in_a_buffer_feed_nothing() {
-    let mut rig = driving();
-    let mut late = Vec::new();
-    for _ in 0..14 {
-        attend(&mut rig);
-        rig.pass(1_000);
-        late.append(&mut rig.stop.check_ins);
-    }
-    assert!(late.len() >= 14 && !moves(&rig));
-    let stood = level(&rig);
-    for (nonce, _) in late {
-        hear(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED });
-    }
-    rig.put(Input::Tick);
-    assert_eq!((level(&rig), stood), (StopLevel::ControlledStopPosture, StopLevel::ControlledStopPosture));
-    // Nor does the answer to a check-in of another.
-    attend(&mut rig);
-    (0..9).for_each(|n| hear(&mut rig, StopNews::CheckedIn { nonce: n, generation: SYNCED }));
-    assert_eq!(level(&rig), StopLevel::ControlledStopPosture);
-    serve(&mut rig, 4_000);
-    assert_eq!((level(&rig), awaiting(&rig).len()), (StopLevel::Halt, 1), "heard again, and a person resumes it");
-}
-
-#[test]
-fn an_answer_of_a_service_that_has_not_told_all_feeds_nothing_and_another_line_is_made() {
-    let mut rig = driving();
-    for _ in 0..8 {
-        rig.pass(500);
-        for (nonce, _) in std::mem::take(&mut rig.stop.check_ins) {
-            hear(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED + 1 });
-        }
-    }
-    assert_eq!((rig.stop.redials.as_slice(), level(&rig)), (&["a stop was not told"][..], StopLevel::Slow));
-}
-
-/// The hall, without people if its rules say so.
-fn rules(rig: &mut Rig, without_people: bool) {
-    let area = AreaPolicy { without_people, ..AreaPolicy::default_of(AreaId::parse("hall").expect("a name")) };
-    let policy =
-        DesiredPolicy { robot_id: RobotId::parse("rbt-01").expect("a name"), generation: 5, areas: vec![area] };
-    rig.down(Downlink { policy: Some(policy), ..Downlink::default() });
-}
-
-#[test]
-fn twenty_seconds_without_the_service_slow_a_robot_where_nobody_walks_and_it_goes_on_by_itself() {
-    let mut rig = driving();
-    rules(&mut rig, true);
-    serve(&mut rig, 1_000);
-    rig.silence(1_000);
-    assert!(said(&rig).is_without_people);
-    answer(&mut rig);
-    hear(&mut rig, StopNews::LineLost);
-    stop_silence(&mut rig, 9_000);
-    assert_eq!((level(&rig), speeds(&rig)), (StopLevel::None, vec![1_500, 1_500]));
-    stop_silence(&mut rig, 11_000);
-    assert_eq!((level(&rig), moves(&rig), speeds(&rig)), (StopLevel::Slow, true, vec![300, 300]));
-    attend(&mut rig);
-    serve(&mut rig, 4_000);
-    assert_eq!((level(&rig), awaiting(&rig).len()), (StopLevel::None, 0));
-    assert_eq!((moves(&rig), speeds(&rig)), (true, vec![1_500, 1_500]));
-}
-
-#[test]
-fn thirty_seconds_stand_it_there_too_and_it_still_goes_on_by_itself() {
-    let mut rig = driving();
-    rules(&mut rig, true);
-    serve(&mut rig, 1_000);
-    hear(&mut rig, StopNews::LineLost);
-    stop_silence(&mut rig, 31_000);
-    assert_eq!((level(&rig), moves(&rig)), (StopLevel::ControlledStopPosture, false));
-    attend(&mut rig);
-    serve(&mut rig, 5_000);
-    assert_eq!((level(&rig), awaiting(&rig).len(), moves(&rig)), (StopLevel::None, 0, true));
-}
-
-#[test]
-fn the_same_twenty_seconds_stand_it_among_people_and_a_person_resumes_it() {
-    let mut rig = driving();
-    rules(&mut rig, false);
-    serve(&mut rig, 1_000);
-    hear(&mut rig, StopNews::LineLost);
-    stop_silence(&mut rig, 20_000);
-    assert_eq!((level(&rig), moves(&rig)), (StopLevel::ControlledStopPosture, false));
-    attend(&mut rig);
-    serve(&mut rig, 5_000);
-    assert_eq!((level(&rig), moves(&rig)), (StopLevel::Halt, false));
-    let waits = awaiting(&rig);
-    assert!(waits.len() == 1 && waits[0].starts_with("SILENCE-rbt-01-"), "{waits:?}");
-    let silence = StopId::parse(&waits[0]).expect("an id");
-    resume(&mut rig, &[silence], true);
-    serve(&mut rig, 2_000);
-    assert_eq!((level(&rig), moves(&rig)), (StopLevel::None, true));
-}
-
-#[test]
-fn a_robot_that_does_not_know_where_it_is_counts_as_among_people() {
-    let mut rig = free();
-    rules(&mut rig, true);
-    serve(&mut rig, 1_000);
-    rig.silence(1_000);
-    assert!(!said(&rig).is_without_people, "no route has told it in which area it stands");
-}
-
-#[test]
-fn a_restart_of_the_links_server_never_moves_the_ladder() {
-    let mut rig = driving();
-    rig.put(Input::Disconnected);
-    for _ in 0..40 {
-        rig.silence(500);
-        answer(&mut rig);
-        assert_eq!(level(&rig), StopLevel::None);
-    }
-    rig.connect();
-    serve(&mut rig, 1_000);
-    assert_eq!(level(&rig), StopLevel::None);
 }
 
 #[test]
@@ -623,7 +489,7 @@ fn a_robot_that_drives_into_a_stopped_part_stands_at_its_border() {
         rig.ms += step.max(1);
         x_mm += 150 * step as i32 / 100;
         stand_at(&rig, x_mm);
-        rig.put(Input::Tick);
+        rig.give(Input::Tick);
         answer(&mut rig);
     }
     assert!((2_500..2_700).contains(&x_mm), "it stands {x_mm} mm from where it set out");
@@ -667,7 +533,9 @@ fn a_line_says_once_a_second_what_is_so_and_at_once_what_has_changed() {
     for _ in 0..20 {
         rig.silence(500);
         let waiting = rig.stop.check_ins.last().cloned();
-        waiting.into_iter().for_each(|(nonce, _)| hear(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED }));
+        waiting
+            .into_iter()
+            .for_each(|(nonce, _)| hear_news(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED }));
     }
     assert_eq!(rig.stop.check_ins.len(), 10);
     let nonces: BTreeSet<u64> = rig.stop.check_ins.iter().map(|(nonce, _)| *nonce).collect();

@@ -1,7 +1,8 @@
-//! Fleet stop by its second way: what the link says of stops is obeyed, and takes back nothing that the stop service itself has not marked.
+//! Fleet stop by its second way: what the link says of stops is obeyed, and takes back nothing that the stop service
+//! itself has not marked.
 
 use crate::rig::Rig;
-use crate::stops::{awaiting, desk, free, freed, hear, level, reset, stop, stop_id};
+use crate::stops::{awaiting, desk, free, freed, hear_news, level, reset, stop, stop_id};
 use midshift_agent::stop::StopNews;
 use midshift_bundle::keys::SecretKey;
 use midshift_core::limits;
@@ -27,8 +28,8 @@ fn says(rig: &mut Rig, stops: Vec<Stop>, resets: Vec<Reset>) {
 /// Its stop line has said the key and is cut; stop 1 was heard on the link alone.
 fn halted() -> Rig {
     let mut rig = free();
-    hear(&mut rig, StopNews::Synced { generation: 10, key: service().public().bytes().to_vec() });
-    hear(&mut rig, StopNews::LineLost);
+    hear_news(&mut rig, StopNews::Synced { generation: 10, key: service().public().bytes().to_vec() });
+    hear_news(&mut rig, StopNews::LineLost);
     says(&mut rig, vec![stop(1, StopLevel::Halt)], vec![]);
     rig
 }
@@ -94,7 +95,7 @@ fn before_the_stop_service_has_said_its_key_no_reset_on_the_link_counts() {
     says(&mut rig, vec![], vec![marked(reset(1), &service())]);
     assert!(is_stopped(&rig));
     // On its own line it needs no mark.
-    hear(&mut rig, StopNews::Told { stops: vec![], resets: vec![reset(1)], generation: 11 });
+    hear_news(&mut rig, StopNews::Told { stops: vec![], resets: vec![reset(1)], generation: 11 });
     assert_eq!(rig.core.kept_stops().count(), 0);
 }
 

@@ -1,12 +1,13 @@
 //! A robot that goes back opens what the newer version wrote, on trial and committed: each kind of file by its name.
 //!
-//! The newer version is this one, with a hand that adds to its files what a release may add (record 0095): a field in each
-//! object, a column in each table, a table, a fact, a lane, a kind of subject, a line in each record. The beacon of a newer
-//! launcher is read in the room that hears it (services/telemetry/src/ear.rs).
+//! The newer version is this one, with a hand that adds to its files what a release may add (record 0095): a field in
+//! each object, a column in each table, a table, a fact, a lane, a kind of subject, a line in each record. The beacon
+//! of a newer launcher is read in the room that hears it (services/telemetry/src/ear.rs).
 
+use crate::lanes::{holder, succeeded};
 use crate::release::Releases;
 use crate::rig::{attempt, place_id};
-use crate::sets::{put, set};
+use crate::sets::{put_content, set};
 use crate::stops::stop;
 use midshift_agent::boot::{BOOT, Boot, Image};
 use midshift_agent::device::DeviceKey;
@@ -18,11 +19,10 @@ use midshift_agent::sets::Sets;
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::stop::keep::{FileStops, KeepStops, STOP_FILE, unreadable};
+use midshift_agent::storage::Proven;
 use midshift_agent::store::{Kept, Op, Store};
 use midshift_agent::trust::Trust;
-use midshift_agent::update::migrate::DueMigration;
-use midshift_agent::update::proven::Proven;
-use midshift_agent::update::{HeldKeys, SoftwareRow, Update};
+use midshift_agent::update::{DueMigration, HeldKeys, SoftwareRow, Update};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::release::Release;
@@ -31,11 +31,11 @@ use midshift_bundle::trust::Trusted;
 use midshift_core::ids::{AreaId, DrainId, RobotId, SiteId};
 use midshift_core::policy::AreaPolicy;
 use midshift_core::reason::{Code, Reason};
-use midshift_core::robot::{Lane, Mode, ReportedAttempt, StopLevel, Vitals};
+use midshift_core::robot::{Lane, Mode, StopLevel, Vitals};
 use midshift_core::stop::robot::Kept as KeptStops;
 use midshift_core::time::Utc;
 use midshift_core::update::UpdateState;
-use midshift_core::work::{AttemptReport, Gap, RobotEvent, SampleBody, StepKind, WorkState, WorkStats};
+use midshift_core::work::{AttemptReport, Gap, RobotEvent, SampleBody, StepKind, WorkState};
 use midshift_durable::record;
 use midshift_latch::LatchFile;
 use serde_json::{Value, json};
@@ -146,37 +146,11 @@ fn proven() -> Proven {
 /// Every kind of fact, subject and attempt.
 fn rows(state: UpdateState) -> Vec<Op> {
     let done = attempt("T1", 4);
-    let report = AttemptReport {
-        attempt: done.clone(),
-        // A state that this version does not know is kept by its number.
-        state: WorkState::Unknown(99),
-        step_index: 2,
-        opened: true,
-        refusal: None,
-        fault: None,
-        stats: WorkStats::default(),
-    };
-    let listed = ReportedAttempt {
-        attempt: done,
-        state: WorkState::Succeeded,
-        step_index: 2,
-        progress: 9,
-        route_index: 1,
-        opened: true,
-    };
-    let holder = Holder {
-        attempt: attempt("T2", 1),
-        step: 1,
-        opened: true,
-        intent: Some(Intent { step: 1, kind: StepKind::Wait { duration_ms: 5 } }),
-        unknown: false,
-        elapsed_ms: 5,
-        duration_ms: 6,
-        base_odometer_mm: 7,
-        base_loaded_mm: 8,
-        base_energy_mwh: 9,
-        hottest_joint_decidegrees: 300,
-    };
+    let (report, listed) = succeeded(&done);
+    // A state that this version does not know is kept by its number.
+    let report = AttemptReport { state: WorkState::Unknown(99), ..report };
+    let intent = Some(Intent { step: 1, kind: StepKind::Wait { duration_ms: 5 } });
+    let holder = Holder { intent, ..holder(attempt("T2", 1)) };
     let key = SecretKey::of_seed([5; 32]).public();
     let software = SoftwareRow {
         directive: 3,
@@ -304,7 +278,7 @@ async fn the_latch_of_a_newer_version_is_obeyed_and_one_with_words_that_nobody_k
     known.latch.engage(stop(1, StopLevel::Halt));
     let mut stops = FileStops::new(&path);
     stops.load(unknown.clone()).await;
-    stops.keep(known.clone()).await.expect("keeps");
+    stops.save(known.clone()).await.expect("keeps");
     drop(stops);
     let rewrites = |change: &dyn Fn(&mut Value)| {
         let (mut file, mut page) = LatchFile::open(&path, 1 << 19, Value::Null).expect("opens");
@@ -360,8 +334,8 @@ fn adds_a_line(path: &Path) {
 
 fn staged(sets: &mut DiskSets, version: &str) -> SetManifest {
     let [program, settings] = ["program", "settings"].map(|what| format!("{what} {version}").into_bytes());
-    put(sets, &program);
-    put(sets, &settings);
+    put_content(sets, &program);
+    put_content(sets, &settings);
     let set = set(version, &program, &settings);
     sets.stage(&set).expect("stages");
     set

@@ -1,4 +1,5 @@
-//! Stolen keys as docs/runbooks/keys.md tells of them: what a thief of each can do to a robot, what he cannot, and that he is nobody once they were changed.
+//! Stolen keys as docs/runbooks/keys.md tells of them: what a thief of each can do to a robot, what he cannot, and that
+//! he is nobody once they were changed.
 
 use crate::release::{Bundle, Releases, SIGNED};
 use crate::rig::Rig;

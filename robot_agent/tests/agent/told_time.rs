@@ -1,8 +1,10 @@
-//! The time that a server tells: over TLS, where it has proven itself, it raises the robot's time floor; in plain text it is a number.
+//! The time that a server tells: over TLS, where it has proven itself, it raises the robot's time floor; in plain text
+//! it is a number.
 
 use crate::release::{Releases, SIGNED};
-use crate::rig::{Rig, TestBody};
+use crate::rig::Rig;
 use crate::session::{Desk, Seen, clock, config};
+use crate::test_body::TestBody;
 use crate::trusts::Metadata;
 use midshift_agent::bulk::Bulk;
 use midshift_agent::dial::TcpDial;
@@ -107,7 +109,7 @@ async fn floor_after(link: TcpDial, mut sessions: mpsc::Receiver<Seen>, told: Ut
     session.next().await.expect("a heartbeat");
     let clock = ClockSample { t3_us: told.0 * 1000, ..ClockSample::default() };
     let echo = Some(Echo { hb: 1, clock, is_clock_doubted: false });
-    session.say(ToRobot::Downlink(Box::new(Downlink { echo, ..Downlink::default() }))).await;
+    session.send(ToRobot::Downlink(Box::new(Downlink { echo, ..Downlink::default() }))).await;
     // What it was told is decided on before its next heartbeat leaves.
     session.next().await.expect("a heartbeat");
     shutdown.cancel();

@@ -1,4 +1,5 @@
-//! Why the agent's rules are as they are: each scenario is played with the rule, which holds, and with the naive one, which does not.
+//! Why the agent's rules are as they are: each scenario is played with the rule, which holds, and with the naive one,
+//! which does not.
 
 use crate::release::Releases;
 use crate::rig::{Rig, goto, point};

@@ -1,6 +1,6 @@
-//! What a robot does with its software: take it, stage it, run it on trial, keep it or go back; and what it does not take.
+//! What a robot does with its software: take it, stage it, run it on trial, keep it or go back; and what it does not
+//! take.
 
-use crate::bases::{a_day_passes, migrations};
 use crate::release::{Bundle, Releases};
 use crate::rig::{Rig, action, place_id};
 use midshift_agent::body::BodyNews;
@@ -8,7 +8,7 @@ use midshift_agent::core::{ExitReason, Input};
 use midshift_agent::sets::Sets;
 use midshift_agent::switch::Switch;
 use midshift_agent::update::Job;
-use midshift_bundle::manifest::{Migration, SafetyClass};
+use midshift_bundle::manifest::SafetyClass;
 use midshift_core::ids::DrainId;
 use midshift_core::reason::Code;
 use midshift_core::robot::{Fault, FaultClass, HardwareStop, Load, Mode};
@@ -103,6 +103,14 @@ pub fn stage(rig: &mut Rig, releases: &Releases, bundle: &Bundle, generation: u6
     let mut order = Order::new(releases.directive(bundle, generation));
     order.generation = generation * 100;
     want(rig, order.to(Goal::Stage));
+    order
+}
+
+/// A bundle staged by the first directive, and a drain in which it may be activated.
+fn stage_in_drain(rig: &mut Rig, releases: &Releases, bundle: &Bundle) -> Order {
+    let mut order = stage(rig, releases, bundle, 1);
+    order.drain_id = Some(drain("drain-1"));
+    maintain(rig, Some(&drain("drain-1")));
     order
 }
 
@@ -390,9 +398,7 @@ fn a_robot_in_a_passage_does_not_change_its_software() {
 fn a_grant_that_was_held_back_longer_than_it_lives_activates_nobody_and_another_is_asked_for() {
     let (mut rig, releases) = connected();
     let bundle = releases.release("1.1.0");
-    let mut order = stage(&mut rig, &releases, &bundle, 1);
-    order.drain_id = Some(drain("drain-1"));
-    maintain(&mut rig, Some(&drain("drain-1")));
+    let mut order = stage_in_drain(&mut rig, &releases, &bundle);
     want(&mut rig, order.to(Goal::Activate));
     assert_eq!(asked(&rig), 1);
     let mut late = order.to(Goal::Activate);
@@ -487,171 +493,6 @@ fn an_order_for_the_set_that_runs_already_is_answered_and_changes_nothing() {
 }
 
 #[test]
-fn a_stuck_robot_goes_back_by_a_newer_order_once_its_kept_set_is_whole_again() {
-    let (rig, releases) = connected();
-    let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
-    let rig = committed(rig, &releases, &first, 1);
-    let kept = name_of(&rig);
-    let (mut rig, mut order) = on_trial(rig, &releases, &second, 2);
-    let sets = rig.updates.as_ref().expect("has them").sets.clone();
-    // The second time its byte is as it was.
-    let rot = || sets.rot(&first.manifest.components[0].digest);
-    rot();
-    want(&mut rig, order.to(Goal::Revert));
-    assert_eq!(state(&rig), Some(UpdateState::Stuck));
-    let order_back = |rig: &mut Rig, generation: u64| {
-        let mut order = Order::new(releases.directive(&second, generation));
-        order.generation = generation * 100_000;
-        want(rig, order.to(Goal::Revert));
-    };
-    order_back(&mut rig, 3);
-    let told = report(&rig).map(|told| (told.state, told.directive));
-    assert_eq!((told, rig.exit), (Some((UpdateState::Stuck, 3)), None), "it looked, and nothing was mended");
-    rot();
-    rig.pass(5_000);
-    assert_eq!(state(&rig), Some(UpdateState::Stuck), "nobody has said so");
-    order_back(&mut rig, 4);
-    let mut rig = relaunch(rig);
-    rig.pass(1_000);
-    assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), kept.as_str()));
-}
-
-#[test]
-fn what_the_launcher_put_away_is_told_and_not_tried_again() {
-    let (mut rig, releases) = connected();
-    let bundle = releases.release("1.1.0");
-    let mut order = stage(&mut rig, &releases, &bundle, 1);
-    activate(&mut rig, &mut order, "drain-1");
-    let sets = rig.updates.as_ref().expect("has them").sets.clone();
-    sets.fall_back(2);
-    let mut rig = relaunch(rig);
-    let told = report(&rig).expect("a report");
-    assert_eq!((told.state, told.tries), (UpdateState::RolledBack, 2));
-    assert_eq!(told.reason.map(|r| r.code), Some(Code::ProgramCrashed));
-    want(&mut rig, order.to(Goal::Stage));
-    rig.pass(60_000);
-    assert_eq!(state(&rig), Some(UpdateState::RolledBack), "the same directive is over");
-}
-
-#[test]
-fn a_set_that_was_put_away_while_it_was_being_committed_is_fallen_and_moves_no_floor_and_no_data() {
-    let (rig, releases) = connected();
-    let bundle = releases.release_as("1.1.0", |m| {
-        m.components[0].rollback_index = 3;
-        m.components[0].data_migration = Migration::Reversible;
-    });
-    let (rig, mut order) = on_trial(rig, &releases, &bundle, 1);
-    // The power went before the switch record was written, and the launcher put the set away.
-    let mut software = rig.store.kept().expect("loaded").ledger.software;
-    software.update.as_mut().expect("an update").state = UpdateState::Committing;
-    rig.store.commit_now(&[midshift_agent::store::Op::Software(Box::new(software))]);
-    rig.updates.as_ref().expect("has them").sets.fall_back(2);
-    let mut rig = rig.restart();
-    rig.connect();
-    want(&mut rig, order.to(Goal::Commit));
-    rig.pass(5_000);
-    let told = report(&rig).expect("a report");
-    let why = told.reason.map(|reason| reason.code);
-    assert_eq!((told.state, told.tries, why), (UpdateState::RolledBack, 2, Some(Code::ProgramCrashed)));
-    let software = rig.store.kept().expect("loaded").ledger.software;
-    assert_eq!((software.floors.len(), software.due.len(), software.committed_at), (0, 0, None));
-    assert_eq!((migrations(&rig), switch(&rig).running()), (vec![], "factory"));
-}
-
-#[test]
-fn a_stopped_robot_goes_back_where_it_stands_and_nothing_moves() {
-    let (rig, releases) = connected();
-    let bundle = releases.release("1.1.0");
-    let (mut rig, mut order) = on_trial(rig, &releases, &bundle, 1);
-    maintain(&mut rig, None);
-    rig.work(rig.desired(Some(rig.offer("T1", 1, vec![action("pick", Effect::Repeatable)], vec![]))));
-    assert!(rig.body.log().acting.is_some());
-    want(&mut rig, order.to(Goal::Revert));
-    assert_eq!((state(&rig), rig.exit), (Some(UpdateState::RollingBack), None), "it works");
-    rig.body.set(|b| b.acting = None);
-    rig.body.says(BodyNews::HardwareStop(HardwareStop::Manual));
-    rig.pass(1_000);
-    let acts = rig.body.log().acts;
-    let mut rig = relaunch(rig);
-    rig.pass(5_000);
-    assert_eq!((state(&rig), rig.body.log().acts), (Some(UpdateState::RolledBack), acts));
-    assert_eq!(switch(&rig).running(), "factory");
-}
-
-#[test]
-fn a_kept_set_that_has_rotted_is_not_gone_back_to_and_a_person_is_asked() {
-    let (rig, releases) = connected();
-    let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
-    let rig = committed(rig, &releases, &first, 1);
-    let (mut rig, mut order) = on_trial(rig, &releases, &second, 2);
-    let sets = rig.updates.as_ref().expect("has them").sets.clone();
-    sets.rot(&first.manifest.components[0].digest);
-    let running = switch(&rig).running().to_owned();
-    want(&mut rig, order.to(Goal::Revert));
-    assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::Stuck), Some(Code::KeptSetBad)));
-    assert_eq!((switch(&rig).running(), rig.exit), (running.as_str(), None));
-}
-
-#[test]
-fn a_committed_set_is_reverted_to_the_one_before_it_unless_its_data_cannot_go_back() {
-    let (rig, releases) = connected();
-    let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
-    let rig = committed(rig, &releases, &first, 1);
-    let kept = name_of(&rig);
-    let mut rig = committed(rig, &releases, &second, 2);
-    let mut order = Order::new(releases.directive(&second, 2));
-    order.generation = 100_000;
-    want(&mut rig, order.to(Goal::Revert));
-    let rig = relaunch(rig);
-    assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), kept.as_str()));
-    let third = releases.release_as("1.3.0", |m| m.components[1].data_migration = Migration::Irreversible);
-    let mut rig = committed(rig, &releases, &third, 2_000);
-    let mut order = Order::new(releases.directive(&third, 2_000));
-    order.generation = 300_000;
-    want(&mut rig, order.to(Goal::Revert));
-    assert_eq!((state(&rig), rig.exit), (Some(UpdateState::Committed), None));
-}
-
-#[test]
-fn a_committed_set_is_left_by_a_directive_of_its_own_after_something_else_was_tried_and_left() {
-    let (rig, releases) = connected();
-    let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
-    let rig = committed(rig, &releases, &first, 1);
-    let kept = name_of(&rig);
-    let (mut rig, mut order) = on_trial(rig, &releases, &second, 2);
-    want(&mut rig, order.to(Goal::Revert));
-    let mut rig = relaunch(rig);
-    assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), kept.as_str()));
-    let mut order = Order::new(releases.directive(&first, 3));
-    order.generation = 100_000;
-    want(&mut rig, order.to(Goal::Revert));
-    let rig = relaunch(rig);
-    assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), "factory"));
-    let told = report(&rig).map(|r| (r.bundle.to_string(), r.directive));
-    assert_eq!(told, Some((first.digest.to_string(), 3)));
-}
-
-#[test]
-fn a_directive_that_was_refused_or_is_about_another_bundle_leads_nobody_back_from_a_good_set() {
-    let (rig, releases) = connected();
-    let (first, second) = (releases.release("1.1.0"), releases.release("1.2.0"));
-    let mut rig = committed(rig, &releases, &first, 1);
-    let kept = name_of(&rig);
-    let stranger = Releases::new().release("6.6.6");
-    let mut order = Order::new(releases.directive(&stranger, 2));
-    order.generation = 100_000;
-    want(&mut rig, order.to(Goal::Stage));
-    assert_eq!(refused(&rig).len(), 1);
-    want(&mut rig, order.to(Goal::Revert));
-    let mut order = Order::new(releases.directive(&second, 3));
-    order.generation = 200_000;
-    want(&mut rig, order.to(Goal::Revert));
-    rig.pass(5_000);
-    assert_eq!((state(&rig), rig.exit), (Some(UpdateState::Committed), None));
-    assert_eq!((switch(&rig).running(), switch(&rig).kept()), (kept.as_str(), Some("factory")));
-}
-
-#[test]
 fn a_floor_rises_with_a_commit_never_above_what_is_kept_and_never_on_trial() {
     let (rig, releases) = connected();
     let indexed = |version: &str, index: u64| releases.release_as(version, |m| m.components[0].rollback_index = index);
@@ -697,17 +538,6 @@ fn an_update_that_is_given_up_before_it_ran_leaves_everything_as_it_was() {
 }
 
 #[test]
-fn a_trial_that_the_ledger_knows_nothing_of_is_ended() {
-    let (rig, releases) = connected();
-    let bundle = releases.release("1.1.0");
-    let (rig, _) = on_trial(rig, &releases, &bundle, 1);
-    rig.store.commit_now(&[midshift_agent::store::Op::Software(Box::default())]);
-    let rig = rig.restart();
-    assert_eq!(switch(&rig).running(), "factory");
-    assert_eq!(rig.exit, Some(ExitReason::Switched), "the program that runs is not the one of the record");
-}
-
-#[test]
 fn a_robot_that_is_not_set_up_for_it_leaves_its_software_alone() {
     let releases = Releases::new();
     let bundle = releases.release("1.1.0");
@@ -723,14 +553,12 @@ fn a_robot_that_is_not_set_up_for_it_leaves_its_software_alone() {
 fn what_was_asked_of_the_disk_is_on_the_ledger_first() {
     let (mut rig, releases) = connected();
     let bundle = releases.release("1.1.0");
-    let mut order = stage(&mut rig, &releases, &bundle, 1);
-    order.drain_id = Some(drain("drain-1"));
-    maintain(&mut rig, Some(&drain("drain-1")));
+    let mut order = stage_in_drain(&mut rig, &releases, &bundle);
     rig.slow_disk = true;
     grant(&mut rig, &mut order, 5_000);
     assert_eq!((switch(&rig), rig.exit), (Switch::default(), None), "SWITCHING is not durable");
     rig.flush();
-    rig.put(Input::Tick);
+    rig.give(Input::Tick);
     assert_eq!(rig.exit, Some(ExitReason::Switched));
     assert!(switch(&rig).trial.is_some());
 }
@@ -754,9 +582,9 @@ fn a_switch_that_waits_for_the_disk_is_not_made_once_its_grant_has_ended_or_some
         rig.slow_disk = true;
         grant(&mut rig, &mut order, 5_000);
         change(&mut rig);
-        rig.put(Input::Tick);
+        rig.give(Input::Tick);
         rig.flush();
-        rig.put(Input::Tick);
+        rig.give(Input::Tick);
         if by.is_empty() {
             assert_eq!(rig.exit, Some(ExitReason::Switched), "nothing came between");
             continue;
@@ -765,24 +593,4 @@ fn a_switch_that_waits_for_the_disk_is_not_made_once_its_grant_has_ended_or_some
         assert_eq!((state(&rig), rig.exit, told.as_deref()), (Some(UpdateState::Staged), None, Some(by)));
         assert_eq!(switch(&rig), Switch::default(), "{by}: what runs is untouched");
     }
-}
-
-#[test]
-fn a_robot_that_gave_up_the_set_before_says_once_that_there_is_no_way_back() {
-    let (rig, releases) = connected();
-    let first = releases.release_base("1.1.0");
-    let mut rig = committed(rig, &releases, &first, 1);
-    a_day_passes(&mut rig, &releases);
-    let (mut rig, mut order) = on_trial(rig, &releases, &releases.release_base("1.2.0"), 2);
-    want(&mut rig, order.to(Goal::Revert));
-    let mut rig = relaunch(rig);
-    rig.pass(1_000);
-    assert_eq!((state(&rig), switch(&rig).kept()), (Some(UpdateState::RolledBack), None), "its slot was taken");
-    let before = refused(&rig).len();
-    let mut back = Order::new(releases.directive(&first, 3));
-    back.generation = 10_000;
-    want(&mut rig, back.to(Goal::Revert));
-    rig.pass(10_000);
-    assert_eq!(refused(&rig)[before..], [Code::NothingKept]);
-    assert_eq!(state(&rig), Some(UpdateState::RolledBack), "it runs what it ran");
 }

@@ -26,7 +26,7 @@ impl Bench {
         new.splice(70_000..70_000, noise(2, 900));
         let patch = patch(&old, &new);
         let (releases, mut sets) = (Releases::new(), MemorySets::new());
-        crate::sets::put(&mut sets, &old);
+        crate::sets::put_content(&mut sets, &old);
         for bytes in [&old, &new, &patch] {
             releases.hold(bytes);
         }

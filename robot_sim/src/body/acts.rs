@@ -1,5 +1,6 @@
 //! What hands do: pick, place, inspect, and the waits between.
 
+use super::act::{Act, Deed};
 use super::{Order, Phase, RECENT_MAX, SimBody};
 use crate::faults;
 use crate::world::{UNNAMED_SKU, lock, sku_of};
@@ -9,33 +10,6 @@ use midshift_core::robot::{Fault, Load};
 use midshift_core::time::{SiteDuration, SiteTime};
 use midshift_core::work::StepKind;
 use rand::RngExt;
-
-/// What is done.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Deed {
-    Pick,
-    Place,
-    Inspect,
-    Wait,
-}
-
-/// An action under way.
-#[derive(Clone, Debug)]
-pub(super) struct Act {
-    pub(super) deed: Deed,
-    /// As the step named it; empty: any.
-    pub(super) item: String,
-    pub(super) left: SiteDuration,
-    pub(super) jams: bool,
-    pub(super) misses: bool,
-}
-
-impl Act {
-    /// Whether joints move.
-    pub(super) fn works(&self) -> bool {
-        self.deed != Deed::Wait
-    }
-}
 
 impl SimBody {
     /// Reads a step into an action, or says what is wrong with it.

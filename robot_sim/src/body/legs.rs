@@ -1,6 +1,7 @@
 //! Legs of a path: setting out, standing still on the way, arriving, and what the contour touches meanwhile.
 //!
-//! Invariant: a leg begins where the body is, so no new path, speed or pause moves it; one that brakes enters nothing that its leg does not lead to.
+//! Invariant: a leg begins where the body is, so no new path, speed or pause moves it; one that brakes enters nothing
+//! that its leg does not lead to.
 
 use super::{Block, CONTOUR_MM, Order, Phase, SPEED_FLOOR_MM_S, SPEED_MAX_MM_S, SimBody};
 use crate::faults::{self, draw_secs};

@@ -1,12 +1,15 @@
 //! The simulated body: poses, battery, joints, faults and hands, advanced from event to event by whoever asks.
 //!
-//! Called by the agent through `trait Body`, and by the simulated person through [`crate::handle::SimHandle`]. Invariant: where
-//! a body is changes only by driving, also across faults, new paths, new speeds and a restart.
+//! Called by the agent through `trait Body`, and by the simulated person through [`crate::handle::SimHandle`].
+//! Invariant: where a body is changes only by driving, also across faults, new paths, new speeds and a restart.
 
+mod act;
 mod acts;
-mod kept;
+mod config;
+mod files;
 mod legs;
 mod orders;
+mod restored;
 
 use crate::behaviour::Behaviour;
 use crate::energy::{Effort, Stores};
@@ -14,129 +17,26 @@ use crate::faults::{self, FaultRates, Injected, draw_next, draw_secs};
 use crate::journal::{Effect, Work};
 use crate::motion::Leg;
 use crate::world::{SharedWorld, lock};
-use acts::Act;
-use kept::Keeper;
-pub use kept::{Error, JOURNAL_FILE};
+use act::Act;
+pub use config::{BodyConfig, Counts, MODEL, SPEED_FLOOR_MM_S, SPEED_MAX_MM_S};
+use files::Keeper;
+pub use files::{Error, JOURNAL_FILE};
 use midshift_agent::body::{BodyNews, PathPoint};
 use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
 use midshift_core::robot::{Fault, HardwareStop, Load, Mode, StopLevel};
 use midshift_core::site::Site;
 use midshift_core::time::{SiteDuration, SiteTime};
 use nalgebra::Isometry2;
-use rand::{RngExt, SeedableRng};
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use tokio::sync::watch;
 
-/// The hardware model of a simulated robot, as bundles name it.
-pub const MODEL: &str = "midshift-sim";
-/// The fastest a simulated body goes, millimetres per second.
-pub const SPEED_MAX_MM_S: u32 = 1_500;
-/// The slowest it is asked to go, millimetres per second; also its speed at the stop level SLOW.
-pub const SPEED_FLOOR_MM_S: u32 = 300;
 /// A body stands on a waypoint while its middle is nearer than this, millimetres.
 pub const CONTOUR_MM: f64 = 300.0;
 /// Effects a body remembers, to say whether a step was done.
 const RECENT_MAX: usize = 32;
-
-/// What one body is like.
-#[derive(Clone, Debug)]
-pub struct BodyConfig {
-    /// Its name.
-    pub robot_id: RobotId,
-    /// Decides all that is drawn, together with its name.
-    pub seed: u64,
-    /// Where it stands when it is made.
-    pub start: WaypointId,
-    /// What the maker allows, millimetres per second; at most [`SPEED_MAX_MM_S`].
-    pub speed_mm_s: u32,
-    /// How fast it really goes of what it is asked for, thousandths, 100..=1000.
-    pub pace_permille: u32,
-    /// How often things go wrong.
-    pub faults: FaultRates,
-    /// State of charge when it is made; none: 600..=1000, drawn.
-    pub battery_permille: Option<u16>,
-    /// The battery empties by work.
-    pub drains: bool,
-    /// What its software makes of it.
-    pub behaviour: Behaviour,
-    /// Version of its software as it says it.
-    pub software: String,
-}
-
-impl BodyConfig {
-    /// A body at its best, with the default faults.
-    pub fn new(robot_id: RobotId, seed: u64, start: WaypointId) -> Self {
-        Self {
-            robot_id,
-            seed,
-            start,
-            speed_mm_s: SPEED_MAX_MM_S,
-            pace_permille: 1000,
-            faults: FaultRates::default(),
-            battery_permille: None,
-            drains: true,
-            behaviour: Behaviour::default(),
-            software: "1.0.0".to_owned(),
-        }
-    }
-    fn rng(&self, life: u32) -> ChaCha8Rng {
-        let name = self
-            .robot_id
-            .as_str()
-            .bytes()
-            .fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3));
-        ChaCha8Rng::seed_from_u64(self.seed ^ name.rotate_left(life % 64))
-    }
-}
-
-/// What a body did and suffered since this process made it.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Counts {
-    /// Milliseconds driving, turning or braking.
-    pub driving_ms: u64,
-    /// Milliseconds acting or waiting as a step asks.
-    pub acting_ms: u64,
-    /// Milliseconds standing before an obstacle.
-    pub blocked_ms: u64,
-    /// Milliseconds standing with an order: paused, broken or driven by a person.
-    pub halted_ms: u64,
-    /// Milliseconds without an order.
-    pub idle_ms: u64,
-    /// Obstacles met.
-    pub obstacles: u64,
-    /// Picks done.
-    pub picks: u64,
-    /// Places done.
-    pub places: u64,
-    /// Picks that closed on nothing.
-    pub misses: u64,
-    /// How often it jammed.
-    pub jams: u64,
-    /// Losses of the network.
-    pub silences: u64,
-    /// Times a person took over.
-    pub manuals: u64,
-}
-
-impl std::ops::AddAssign for Counts {
-    fn add_assign(&mut self, other: Self) {
-        self.driving_ms += other.driving_ms;
-        self.acting_ms += other.acting_ms;
-        self.blocked_ms += other.blocked_ms;
-        self.halted_ms += other.halted_ms;
-        self.idle_ms += other.idle_ms;
-        self.obstacles += other.obstacles;
-        self.picks += other.picks;
-        self.places += other.places;
-        self.misses += other.misses;
-        self.jams += other.jams;
-        self.silences += other.silences;
-        self.manuals += other.manuals;
-    }
-}
 
 #[derive(Clone, Debug)]
 enum Order {

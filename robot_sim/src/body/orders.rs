@@ -120,7 +120,7 @@ impl Body for SimBody {
     }
     fn poll(&mut self, now: SiteTime) -> Vec<BodyNews> {
         self.advance(now);
-        self.keep();
+        self.write_file();
         self.news.drain(..).collect()
     }
     fn next_change(&self, now: SiteTime) -> Option<SiteTime> {

@@ -22,7 +22,7 @@ use midshift_core::site::{Site, grid};
 use midshift_core::task::Phase;
 use midshift_core::time::{Clock, SiteTime};
 use midshift_sim::faults::FaultRates;
-use midshift_sim::hall::{Hall, HallConfig, Persistence};
+use midshift_sim::fleet::{Fleet, FleetConfig, Persistence};
 use midshift_sim::service::SimFace;
 use midshift_sim::swarm::{Swarm, SwarmConfig};
 use midshift_store::{
@@ -172,7 +172,7 @@ async fn play(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Resul
     let clock = clock::clock(if scene.is_some() { 1000 } else { (args.speedup * 1000.0) as u32 });
     crate::recorder::handle();
     let hall_config = hall_config(&args, &site, scene.as_ref());
-    let hall = Arc::new(Hall::open(&hall_config, &clock.now())?);
+    let hall = Arc::new(Fleet::open(&hall_config, &clock.now())?);
     let listener = TcpListener::bind(args.listen)
         .await
         .with_context(|| format!("listening on {}; is another midshift running?", args.listen))?;
@@ -298,8 +298,8 @@ impl Scene {
     fn stage(
         self,
         args: &Dev,
-        config: &HallConfig,
-        hall: &Hall,
+        config: &FleetConfig,
+        hall: &Fleet,
         sight: Sight,
         [address, stops]: [SocketAddr; 2],
         trust: Trust,
@@ -335,7 +335,7 @@ impl Scene {
 /// The site, with a starting place for each robot of the run: nobody else is given it before the robot was heard.
 fn site_of(args: &Dev, loaded: &Loaded) -> anyhow::Result<Arc<Site>> {
     let site = loaded.site.clone();
-    let mut config = HallConfig::new(site.clone(), args.robots, args.seed);
+    let mut config = FleetConfig::new(site.clone(), args.robots, args.seed);
     if let Some(path) = &args.agents {
         let text = std::fs::read_to_string(path).with_context(|| format!("reading {}", path.display()))?;
         config.starts = Some(grid::parse_starts(&site, &text)?);
@@ -345,8 +345,8 @@ fn site_of(args: &Dev, loaded: &Loaded) -> anyhow::Result<Arc<Site>> {
     Ok(Arc::new(Arc::unwrap_or_clone(site).with_starts(&starts)?))
 }
 
-fn hall_config(args: &Dev, site: &Arc<Site>, scene: Option<&Scene>) -> HallConfig {
-    let mut config = HallConfig::new(site.clone(), args.robots, args.seed);
+fn hall_config(args: &Dev, site: &Arc<Site>, scene: Option<&Scene>) -> FleetConfig {
+    let mut config = FleetConfig::new(site.clone(), args.robots, args.seed);
     config.drains = site.chargers().next().is_some();
     if let Some(scene) = scene {
         config.only = Some(0..args.robots - scene.launched);
@@ -418,7 +418,7 @@ struct Run {
     args: Dev,
     site: Arc<Site>,
     clock: Arc<dyn Clock>,
-    hall: Arc<Hall>,
+    hall: Arc<Fleet>,
     run_id: String,
     /// Number of the newest task when the run began.
     before: u64,

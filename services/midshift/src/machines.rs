@@ -3,10 +3,11 @@
 //! Invariant: what a simulated robot shows is what a real one would: the server makes no difference.
 
 use anyhow::Context;
-use midshift_agent::device::{self, DeviceKey};
+use midshift_agent::device::DeviceKey;
 use midshift_agent::dial::TcpDial;
 use midshift_agent::enrolment::{Enrolled, Identity, Invitation};
 use midshift_agent::sqlite::SqliteStore;
+use midshift_agent::store::device_key;
 use midshift_agent::tls::Tls;
 use midshift_cli::way::Way;
 use midshift_core::Boxed;
@@ -72,7 +73,7 @@ impl Machines {
     pub fn keep(self, server: &str, clock: &Arc<dyn Clock>) -> anyhow::Result<Vec<AbortOnDropHandle<()>>> {
         let keep = |machine: Identity| {
             let dial = TcpDial::new(&format!("https://{server}"), None)?.with_tls(machine.tls());
-            Ok(AbortOnDropHandle::new(tokio::spawn(machine.keep(Arc::new(dial), clock.clone()))))
+            Ok(AbortOnDropHandle::new(tokio::spawn(machine.renew_when_due(Arc::new(dial), clock.clone()))))
         };
         self.0.into_iter().map(keep).collect()
     }
@@ -89,7 +90,7 @@ async fn machine(
         Some(folder) => {
             midshift_durable::make_folder(folder).with_context(|| format!("making {}", folder.display()))?;
             let mut ledger = SqliteStore::open(&folder.join(AGENT_FILE)).await?;
-            device::key_of(&mut ledger, &format!("{:032x}", rand::random::<u128>())).await?
+            device_key(&mut ledger, &format!("{:032x}", rand::random::<u128>())).await?
         }
     };
     let known = folder.as_deref().map(Enrolled::read).transpose()?.flatten();

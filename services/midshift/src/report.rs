@@ -6,7 +6,7 @@ use midshift_core::ids::TaskId;
 use midshift_core::task::Phase;
 use midshift_core::time::Clock;
 use midshift_core::work::Live;
-use midshift_sim::hall::HallReport;
+use midshift_sim::fleet::FleetReport;
 use midshift_store::LiveBoard;
 use serde::Serialize;
 use std::collections::BTreeSet;
@@ -140,7 +140,7 @@ pub struct Report {
     /// What the run is held to, beside the laws.
     pub asked: Amounts,
     /// What the bodies say.
-    pub bodies: HallReport,
+    pub bodies: FleetReport,
     /// What a story came to.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub story: Option<Story>,
@@ -176,7 +176,7 @@ pub struct Inputs {
     /// Tasks as their rows say.
     pub tasks: Tasks,
     /// What the bodies of the robots say.
-    pub bodies: HallReport,
+    pub bodies: FleetReport,
     /// Waits for places.
     pub place_waits: u64,
     /// See [`watch_progress`].

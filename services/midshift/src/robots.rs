@@ -14,7 +14,7 @@ use midshift_core::ids::WaypointId;
 use midshift_core::time::Clock;
 use midshift_sim::body::{BodyConfig, SimBody};
 use midshift_sim::faults::FaultRates;
-use midshift_sim::hall::{Hall, HallConfig, Persistence};
+use midshift_sim::fleet::{Fleet, FleetConfig, Persistence};
 use midshift_sim::handle::SimHandle;
 use midshift_sim::person::Person;
 use midshift_sim::service::SimFace;
@@ -164,7 +164,7 @@ async fn one_agent(args: AgentRun, hand: Hand, stop: CancellationToken) -> anyho
     hand(&handle, &clock);
     let _person =
         args.person.then(|| AbortOnDropHandle::new(tokio::spawn(visit(handle.clone(), args.seed, clock.clone()))));
-    let mut pulse = midshift_agent::pulse::for_launcher();
+    let mut pulse = midshift_agent::launcher_heartbeat::for_launcher();
     if let Some(software) = &software {
         pulse = software.pulse(pulse, &clock);
     }
@@ -191,7 +191,7 @@ pub fn swarm(args: SimRun, signed_in: Option<Way>, stop: CancellationToken) -> B
 async fn swarming(args: SimRun, signed_in: Option<Way>, stop: CancellationToken) -> anyhow::Result<()> {
     let site = site_file::load(args.site.as_deref(), None, None)?.site;
     let clock: Arc<dyn Clock> = clock::clock(1000);
-    let mut config = HallConfig::new(site, args.robots, args.seed);
+    let mut config = FleetConfig::new(site, args.robots, args.seed);
     config.only = args.only.map(|(from, to)| from..to);
     config.prefix.clone_from(&args.prefix);
     config.crowded = args.crowded;
@@ -202,7 +202,7 @@ async fn swarming(args: SimRun, signed_in: Option<Way>, stop: CancellationToken)
         config.persistence = Persistence::Dir(dir.clone());
     }
     let trust = args.trust.as_deref().map(|file| software::trust_of(file, &config.site)).transpose()?;
-    let hall = Arc::new(Hall::open(&config, &clock.now())?);
+    let hall = Arc::new(Fleet::open(&config, &clock.now())?);
     let (machines, scheme) = match &signed_in {
         None => (None, "http"),
         Some(way) => {

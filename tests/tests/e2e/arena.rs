@@ -22,7 +22,7 @@ use midshift_proto::fleet::v1::{
 };
 use midshift_proto::task::v1::{CancelTaskRequest, GetTaskRequest, Task, TaskState};
 use midshift_sim::faults::FaultRates;
-use midshift_sim::hall::{Hall, HallConfig};
+use midshift_sim::fleet::{Fleet, FleetConfig};
 use midshift_sim::swarm::{Swarm, SwarmConfig};
 use midshift_sim::workload::{Workload, WorkloadConfig};
 use midshift_tests::metrics::Metrics;
@@ -81,7 +81,7 @@ pub struct Arena {
     pub site: Arc<Site>,
     /// The clock of all robots of this program.
     pub clock: Arc<dyn Clock>,
-    hall: Arc<Hall>,
+    hall: Arc<Fleet>,
     workload: Workload,
     asked: Arc<AtomicUsize>,
     /// Memory of the server while its honest robots worked alone, KiB.
@@ -108,13 +108,13 @@ impl Arena {
     pub async fn open(seed: u64) -> anyhow::Result<Self> {
         let (dir, site, clock) = (folder()?, Arc::new(text::parse(DEMO)?), midshift::clock::clock(1000));
         let server = Server::start(dir.path()).await?;
-        let of_hall = HallConfig {
+        let of_hall = FleetConfig {
             faults: FaultRates::none(),
             drains: false,
             pace_permille: PACE_PERMILLE,
-            ..HallConfig::new(site.clone(), HONEST, seed)
+            ..FleetConfig::new(site.clone(), HONEST, seed)
         };
-        let hall = Arc::new(Hall::open(&of_hall, &clock.now())?);
+        let hall = Arc::new(Fleet::open(&of_hall, &clock.now())?);
         let ids: Vec<RobotId> = hall.robots().iter().map(|robot| robot.robot_id().clone()).collect();
         let machines = Machines::enrol(&server.way()?, &server.address.to_string(), ids, None).await?;
         let uri = format!("https://{}", server.address);
@@ -355,7 +355,7 @@ impl Arena {
             self.alive().await?.iter().map(|t| format!("{} {:?} {}", t.task_id, t.state(), t.robot_id)).collect();
         self.check("every task ends", open.is_empty(), || format!("{open:?}"));
         let verdict = self.hall.verdict()?;
-        let drops = midshift_sim::world::lock(&self.hall.worlds()[0]).oracle().drops_by_task();
+        let drops = midshift_sim::world::lock(&self.hall.worlds()[0]).judge().drops_by_task();
         self.check("no step is done twice", verdict.steps_done_twice == 0, || format!("{verdict:?}"));
         self.check("no place was too full", verdict.exclusion_violations == 0, || format!("{verdict:?}"));
         for (task_id, times) in &drops {

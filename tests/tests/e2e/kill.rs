@@ -7,7 +7,7 @@ use midshift_agent::ledger::Holder;
 use midshift_cli::task_list::request;
 use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::task::v1::{SubmitTasksRequest, Task, TaskState};
-use midshift_sim::oracle::Oracle;
+use midshift_sim::judge::Judge;
 use midshift_sim::workload::{Workload, WorkloadConfig};
 use midshift_tests::postgres::PostgresServer;
 use rand::rngs::StdRng;
@@ -222,7 +222,7 @@ pub fn judge_each(tasks: &[Task], inside: &BTreeSet<String>, site: &Site, paths:
         );
     }
     let paths: Vec<&Path> = paths.iter().map(PathBuf::as_path).collect();
-    let oracle = Oracle::read(site, paths)?;
+    let oracle = Judge::read(site, paths)?;
     let verdict = oracle.verdict();
     say!("{verdict:?}");
     // A task may carry what an earlier one put down, so items are fewer than tasks; drops are not.

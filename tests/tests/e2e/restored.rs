@@ -10,7 +10,7 @@ use midshift_proto::task::v1::submit_task_result::Outcome;
 use midshift_proto::task::v1::{SubmitTasksRequest, TaskState};
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
 use midshift_proto::telemetry::v1::{ListEventsRequest, event::Item};
-use midshift_sim::oracle::Oracle;
+use midshift_sim::judge::Judge;
 use midshift_sim::workload::{Workload, WorkloadConfig};
 use midshift_tests::postgres::PostgresServer;
 use std::collections::BTreeMap;
@@ -165,7 +165,7 @@ async fn drill(engine: Engine) -> anyhow::Result<()> {
     let reasons = reasons_of_gaps(&server).await?;
     assert!(!reasons.is_empty() && reasons.iter().all(|code| code == "FREED_AFTER_ACK"), "{reasons:?}");
     let journals = robots.journals();
-    let verdict = Oracle::read(&site, journals.iter().map(PathBuf::as_path))?.verdict();
+    let verdict = Judge::read(&site, journals.iter().map(PathBuf::as_path))?.verdict();
     assert!(verdict.items_conserved() && verdict.exclusion_violations == 0, "{verdict:?}");
     Ok(())
 }

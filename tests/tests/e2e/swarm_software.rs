@@ -37,7 +37,7 @@ use midshift_proto::session::{
 use midshift_sim::behaviour::{Behaviour, COMPONENT};
 use midshift_sim::body::MODEL;
 use midshift_sim::faults::FaultRates;
-use midshift_sim::hall::{Hall, HallConfig};
+use midshift_sim::fleet::{Fleet, FleetConfig};
 use midshift_sim::swarm::{DialFor, Swarm, SwarmConfig};
 use std::io;
 use std::path::Path;
@@ -117,7 +117,7 @@ impl LinkService for Desk {
 struct Bench {
     dir: TempDir,
     made: Made,
-    hall: Arc<Hall>,
+    hall: Arc<Fleet>,
     sessions: mpsc::Receiver<Seen>,
     session: Option<Seen>,
     epoch: u64,
@@ -151,7 +151,7 @@ async fn publish(channel: Channel, made: &Made) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn trust(made: &Made, keys: &Path, hall: &HallConfig) -> anyhow::Result<Trust> {
+fn trust(made: &Made, keys: &Path, hall: &FleetConfig) -> anyhow::Result<Trust> {
     let root = Folder::open(&made.repository)?.document("1.root.json")?.context("no root")?;
     let key = SecretKey::read(&keys.join("directive-1.pem"))?.public();
     Ok(Trust { root, directive_keys: [(key.id(), key)].into(), site: hall.site.site_id().clone() })
@@ -186,8 +186,8 @@ impl Bench {
         publish(people.dial().await?, &made).await?;
 
         let site = Arc::new(text::parse(CORRIDOR)?);
-        let quiet = HallConfig { faults: FaultRates::none(), drains: false, ..HallConfig::new(site, 1, 7) };
-        let hall = Arc::new(Hall::open(&quiet, &clock.now())?);
+        let quiet = FleetConfig { faults: FaultRates::none(), drains: false, ..FleetConfig::new(site, 1, 7) };
+        let hall = Arc::new(Fleet::open(&quiet, &clock.now())?);
         let fetched: Arc<AtomicU64> = Arc::default();
         let to = |make: fn(&str) -> Result<Endpoint, dial::Error>, came: Arc<AtomicU64>| -> DialFor {
             let ends = ends.clone();

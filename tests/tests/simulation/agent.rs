@@ -16,7 +16,7 @@ use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
 use midshift_agent::memory::MemoryStore as RobotMemory;
 use midshift_agent::session::{self, AgentConfig, Lines, Updates};
-use midshift_agent::starts::HANG_SECONDS;
+use midshift_agent::start_policy::HANG_SECONDS;
 use midshift_agent::trust::Trust;
 use midshift_core::robot::StopLevel;
 use midshift_core::time::Clock;

@@ -26,7 +26,7 @@ use midshift_core::time::{SiteDuration, SiteTime};
 use midshift_edge::Incoming;
 use midshift_ota::rollouts::RolloutService;
 use midshift_sim::faults::{FaultRates, Injected};
-use midshift_sim::hall::{Hall, HallConfig};
+use midshift_sim::fleet::{Fleet, FleetConfig};
 use midshift_sim::launched::Launched;
 use midshift_store::{FRAME_BYTES_DEFAULT, FrameLog, MemoryFrames, MemoryStore, StoreId};
 use midshift_tests::player::Player;
@@ -97,7 +97,7 @@ pub struct Room {
     /// The witness.
     pub observer: Shared,
     /// The bodies.
-    pub hall: Arc<Hall>,
+    pub hall: Arc<Fleet>,
     /// The server's disk.
     pub disk: Arc<ServerDisk>,
     /// What clients ask for.
@@ -139,8 +139,9 @@ impl Room {
         let disk = Arc::new(ServerDisk::new(store.clone(), observer.clone(), config.seed, config.newer.clone()));
         let frames = MemoryFrames::new(clock.clone(), FRAME_BYTES_DEFAULT);
         let frames: Arc<dyn FrameLog> = Arc::new(ServerFrames::new(frames, disk.clone()));
-        let of_hall = HallConfig { faults: config.faults, ..HallConfig::new(site.clone(), config.robots, config.seed) };
-        let hall = Arc::new(Hall::open(&of_hall, &clock.now())?);
+        let of_hall =
+            FleetConfig { faults: config.faults, ..FleetConfig::new(site.clone(), config.robots, config.seed) };
+        let hall = Arc::new(Fleet::open(&of_hall, &clock.now())?);
         observer.look().watch_world(hall.worlds()[0].clone());
         let wire = Wire::default();
         let software = Arc::new(Software::make(clock.now().wall, site.site_id().clone())?);

@@ -15,7 +15,7 @@ use clap::{Parser, Subcommand};
 use midshift_agent::core::ExitReason;
 use midshift_agent::launcher::{self, ENVIRONMENT, SWITCHED};
 use midshift_agent::program::told_to_end;
-use midshift_agent::{environment, pulse};
+use midshift_agent::{environment, launcher_heartbeat};
 use midshift_cli::client::Exit;
 use midshift_cli::out::{Format, Out, Output};
 use std::path::PathBuf;
@@ -112,7 +112,7 @@ pub fn main() -> ExitCode {
         return launcher::main(arguments.into_iter());
     }
     if let Command::Agent(_) = &args.command
-        && let Err(error) = pulse::follow_launcher()
+        && let Err(error) = launcher_heartbeat::follow_launcher()
     {
         // Nobody would start this agent again, or kill it if it hung.
         let gone = Exit::new(ENVIRONMENT, format!("the launcher that started this agent is not there: {error}"));

@@ -8,7 +8,7 @@ use midshift_core::rows::{Item, Writer};
 use midshift_core::site::{DEMO, text};
 use midshift_core::task::forms::Transport;
 use midshift_core::task::{Phase, TaskIntake, TaskState};
-use midshift_sim::hall::{Hall, HallConfig, HallReport};
+use midshift_sim::fleet::{Fleet, FleetConfig, FleetReport};
 use midshift_store::{MemoryStore, Store, StoreId};
 use std::sync::Arc;
 
@@ -51,9 +51,9 @@ async fn admit(store: &Arc<dyn Store>, number: usize, request_id: &str, phase: P
     Ok(intake.task_id)
 }
 
-fn bodies() -> anyhow::Result<HallReport> {
+fn bodies() -> anyhow::Result<FleetReport> {
     let clock = clock::clock(1_000);
-    let hall = Hall::open(&HallConfig::new(Arc::new(text::parse(DEMO)?), ROBOTS, 1), &clock.now())?;
+    let hall = Fleet::open(&FleetConfig::new(Arc::new(text::parse(DEMO)?), ROBOTS, 1), &clock.now())?;
     Ok(hall.report(clock.now().site)?)
 }
 
