@@ -7,6 +7,12 @@
 mod circles;
 #[path = "architecture/pages.rs"]
 mod pages;
+#[path = "architecture/serde_types.rs"]
+mod serde_types;
+#[path = "architecture/source.rs"]
+mod source;
+#[path = "architecture/stored_keys.rs"]
+mod stored_keys;
 #[path = "architecture/twins.rs"]
 mod twins;
 
