@@ -68,7 +68,7 @@ const MADE: [&str; 16] = [
 ];
 /// Tables with rows of one type each, which a macro or a trait names, by the module of the type.
 const MANY: &[(&str, &[Table])] = &[
-    ("audit", &[Table::TaskAudit, Table::FleetAudit, Table::OtaAudit, Table::StopAudit, Table::IdentityAudit]),
+    ("audit/chain", &[Table::TaskAudit, Table::FleetAudit, Table::OtaAudit, Table::StopAudit, Table::IdentityAudit]),
     ("lead", &[Table::FleetLeader, Table::OtaLeader]),
     ("once", &[Table::CommandKey, Table::OtaCommandKey]),
 ];
