@@ -112,6 +112,7 @@ fn a_circle_is_found_however_its_arrows_are_written() {
         ("use super::x as z;", true),
         ("mod z { use super::x; }", false),
         ("mod z { use super::super::x; }", true),
+        ("const T: &str = r#\"{\"}\"#;\nuse super::x;", true),
     ] {
         let found = in_circles_of(&[lib, door, ("src/a/x.rs", "use super::y;"), ("src/a/y.rs", back)]);
         assert_eq!(found.contains("src/a/x.rs"), is_circle, "{back}");
