@@ -5,8 +5,8 @@
 //! a commit waits for its log. Called by `plan`, `submit`, `offer`, `link` and `stop`.
 
 use crate::child::{Child, cpu_of_ended_s, cpu_of_s};
+use crate::durable_baseline::DurableBaseline;
 use crate::fsync::{Disk, place};
-use crate::raw::Raw;
 use anyhow::{Context, bail, ensure};
 use sqlx::postgres::PgConnection;
 use sqlx::{Connection, Executor};
@@ -168,11 +168,11 @@ impl Bed<'_> {
         Child::serve(&self.dir.path().join("data"), site, self.url(), core).await
     }
     /// The raw limit here.
-    pub async fn raw(&self) -> anyhow::Result<Raw> {
-        let Some(url) = self.url() else { return Ok(Raw::Disk(Disk::beside(self.dir.path())?)) };
+    pub async fn baseline(&self) -> anyhow::Result<DurableBaseline> {
+        let Some(url) = self.url() else { return Ok(DurableBaseline::Disk(Disk::beside(self.dir.path())?)) };
         let mut connection = PgConnection::connect(url).await?;
         connection.execute("CREATE TABLE raw_commit (id bigserial PRIMARY KEY, body bytea NOT NULL)").await?;
-        Ok(Raw::Commit(Box::new(connection)))
+        Ok(DurableBaseline::Commit(Box::new(connection)))
     }
     /// Rows a second of `bytes` each by COPY in the binary format on one connection, so many in each commit; none where there is no such thing.
     /// What is sent lies ready before the clock runs.
@@ -226,7 +226,7 @@ mod tests {
         let bed = engine.bed(None).expect("a place");
         assert!(bed.copied_per_s(10, 100, 3).await.expect("rows").is_some_and(|per_s| per_s > 0.0));
         // Somebody uses it still.
-        let _raw = bed.raw().await.expect("a connection");
+        let _baseline = bed.baseline().await.expect("a connection");
         assert_eq!(server.ask(&server.url("postgres"), DATABASES), "1");
         drop(bed);
         assert_eq!(server.ask(&server.url("postgres"), DATABASES), "0");

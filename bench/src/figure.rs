@@ -54,7 +54,7 @@ pub fn percentile(values: &[f64], share: f64) -> f64 {
 
 impl Figure {
     /// From the values of several runs and those of its limit.
-    pub fn of(
+    pub fn new(
         target: &'static str,
         name: impl Into<String>,
         unit: &'static str,

@@ -5,10 +5,10 @@
 //! that of an EVENT, from one more robot that sends them one by one under the same load, after the CPU was counted. On PostgreSQL the
 //! CPU is the server's own; what the database spends beside it is told for itself.
 
-use crate::child::{Child, MESSAGES, SESSIONS, files_max};
+use crate::child::{Child, MESSAGES, SESSIONS, raise_files_max};
 use crate::engine::{Bed, Engine, EngineArgs};
 use crate::figure::{Figure, percentile};
-use crate::{flood, hall};
+use crate::{grid_map, saturation};
 use anyhow::{Context, ensure};
 use std::path::Path;
 use std::time::Duration;
@@ -93,7 +93,7 @@ type Legs = Vec<Leg>;
 
 /// How many robots this machine's limits allow, and which limit it is if it is fewer than were wanted.
 pub fn allowed(wanted: Option<usize>) -> anyhow::Result<(usize, Option<String>)> {
-    let (wanted, files) = (wanted.unwrap_or(ROBOTS), files_max()?);
+    let (wanted, files) = (wanted.unwrap_or(ROBOTS), raise_files_max()?);
     let robots = wanted.min(usize::try_from(files.saturating_sub(OTHER_FILES))?);
     let note = format!(
         "{robots} of {wanted} robots: the hard limit of RLIMIT_NOFILE is {files} and the server needs a descriptor for each"
@@ -143,7 +143,7 @@ fn acks(engine: &Engine, load: &str, legs: &Legs) -> [Figure; 2] {
         let acks = each(legs, |l| percentile(&l.acks_ms, share));
         let limit = format!("{}, {word}", engine.limit());
         let name = format!("{load}: EVENT to its ack, {word}{}", engine.suffix());
-        Figure::of("P1", name, "ms", &acks, Some((&limit, &raws)))
+        Figure::new("P1", name, "ms", &acks, Some((&limit, &raws)))
     })
 }
 
@@ -151,7 +151,7 @@ fn acks(engine: &Engine, load: &str, legs: &Legs) -> [Figure; 2] {
 fn database_cpu(name: String, legs: &Legs) -> Option<Figure> {
     let database: Vec<f64> = legs.iter().filter_map(|l| Some(l.database_cpu_s? * 1e6 / l.messages)).collect();
     let own = each(legs, |l| l.cpu_s * 1e6 / l.messages);
-    (!database.is_empty()).then(|| Figure::of("P1", name, "us", &database, Some(("midshift's own", &own))))
+    (!database.is_empty()).then(|| Figure::new("P1", name, "us", &database, Some(("midshift's own", &own))))
 }
 
 fn at_one_a_second(engine: &Engine, robots: usize, ours: &Legs, sink: &Legs, answering: &Legs) -> Vec<Figure> {
@@ -159,22 +159,22 @@ fn at_one_a_second(engine: &Engine, robots: usize, ours: &Legs, sink: &Legs, ans
     let bare = "bare tonic sink, same robots";
     let (unit, each_cpu) = ("1/CPU-s", |l: &Leg| l.cpu_s * 1e6 / l.messages);
     let mut figures = vec![
-        Figure::of("P1", name("reports"), unit, &each(ours, per_cpu), Some((bare, &each(sink, per_cpu)))),
-        Figure::of(
+        Figure::new("P1", name("reports"), unit, &each(ours, per_cpu), Some((bare, &each(sink, per_cpu)))),
+        Figure::new(
             "P1",
             name("reports, each echoed"),
             unit,
             &each(ours, per_cpu),
             Some(("bare tonic that answers each", &each(answering, per_cpu))),
         ),
-        Figure::of("P1", name("CPU of a report"), "us", &each(ours, each_cpu), Some((bare, &each(sink, each_cpu)))),
+        Figure::new("P1", name("CPU of a report"), "us", &each(ours, each_cpu), Some((bare, &each(sink, each_cpu)))),
     ];
     figures.extend(acks(engine, &format!("{robots} x 1 Hz"), ours));
     figures.extend(database_cpu(name("CPU of the database for a report"), ours));
     let (memory, cores) = (|l: &Leg| l.robot_kib, |l: &Leg| l.cpu_s / l.wall_s);
     figures.extend([
-        Figure::of("P4", name("memory per robot"), "KiB", &each(ours, memory), Some((bare, &each(sink, memory)))),
-        Figure::of("P4", name("server, idle robots"), "cores", &each(ours, cores), Some((bare, &each(sink, cores)))),
+        Figure::new("P4", name("memory per robot"), "KiB", &each(ours, memory), Some((bare, &each(sink, memory)))),
+        Figure::new("P4", name("server, idle robots"), "cores", &each(ours, cores), Some((bare, &each(sink, cores)))),
     ]);
     figures
 }
@@ -184,16 +184,16 @@ fn at_the_knee(engine: &Engine, robots: usize, ours: &Legs, sink: &Legs) -> Vec<
     let bare = "bare tonic sink, same messages";
     let (rate, each_cpu) = (|l: &Leg| l.messages / l.wall_s, |l: &Leg| l.cpu_s * 1e6 / l.messages);
     let mut figures = vec![
-        Figure::of("P1", name("durable reports"), "1/CPU-s", &each(ours, per_cpu), Some((bare, &each(sink, per_cpu)))),
-        Figure::of("P1", name("CPU of a report"), "us", &each(ours, each_cpu), Some((bare, &each(sink, each_cpu)))),
-        Figure::of("P1", name("durable reports"), "1/s", &each(ours, rate), Some((bare, &each(sink, rate)))),
+        Figure::new("P1", name("durable reports"), "1/CPU-s", &each(ours, per_cpu), Some((bare, &each(sink, per_cpu)))),
+        Figure::new("P1", name("CPU of a report"), "us", &each(ours, each_cpu), Some((bare, &each(sink, each_cpu)))),
+        Figure::new("P1", name("durable reports"), "1/s", &each(ours, rate), Some((bare, &each(sink, rate)))),
     ];
     figures.extend(acks(engine, &format!("knee, {robots} robots"), ours));
     figures.extend(database_cpu(name("CPU of the database for a report"), ours));
     let copied: Vec<f64> = ours.iter().filter_map(|l| l.copied_per_s).collect();
     if !copied.is_empty() {
         let limit = format!("COPY of rows of {REPORT_BYTES} B, {COPIED_AT_ONCE} a commit");
-        figures.push(Figure::of(
+        figures.push(Figure::new(
             "P1",
             name("durable reports, by COPY"),
             "1/s",
@@ -216,7 +216,7 @@ async fn server(of: Of<'_>, bed: &Bed<'_>, map: &Path) -> anyhow::Result<Child> 
 /// One server with all robots, real agents in simulators of their own, each at one report a second.
 async fn steady(args: &LinkArgs, robots: usize, of: Of<'_>) -> anyhow::Result<Leg> {
     let bed = of.engine().bed(args.engine.dir.as_ref())?;
-    let map = hall::map(bed.path(), (robots as f64).sqrt() as usize + 2)?;
+    let map = grid_map::write(bed.path(), (robots as f64).sqrt() as usize + 2)?;
     let mut server = server(of, &bed, &map).await?;
     let bare_kib = server.rss_kib()?;
     let (address, map) = (server.address.to_string(), map.to_str().context("a path that is no text")?);
@@ -243,7 +243,7 @@ async fn steady(args: &LinkArgs, robots: usize, of: Of<'_>) -> anyhow::Result<Le
 /// One server with few robots that report as fast as their credit lets them.
 async fn knee(args: &LinkArgs, of: Of<'_>) -> anyhow::Result<Leg> {
     let bed = of.engine().bed(args.engine.dir.as_ref())?;
-    let map = hall::map(bed.path(), (args.knee_robots as f64).sqrt() as usize + 2)?;
+    let map = grid_map::write(bed.path(), (args.knee_robots as f64).sqrt() as usize + 2)?;
     let mut server = server(of, &bed, &map).await?;
     let (address, robots) = (server.address.to_string(), args.knee_robots.to_string());
     let mut role = vec!["flood", "--server", &address, "--robots", &robots];
@@ -284,8 +284,8 @@ async fn measure(
 /// Under the load that is there, one more robot asks how long an acknowledgement takes, and the raw limit is asked in turn with it.
 async fn ask(args: &LinkArgs, server: &Child, bed: &Bed<'_>, of: Of<'_>, leg: &mut Leg) -> anyhow::Result<()> {
     if matches!(of, Of::Midshift(_)) {
-        let (mut raw, long) = (bed.raw().await?, Duration::from_secs(args.ask_seconds));
-        (leg.acks_ms, leg.raws_ms) = flood::ask(&server.address.to_string(), &mut raw, long).await?;
+        let (mut baseline, long) = (bed.baseline().await?, Duration::from_secs(args.ask_seconds));
+        (leg.acks_ms, leg.raws_ms) = saturation::measure_acks(&server.address.to_string(), &mut baseline, long).await?;
     }
     Ok(())
 }

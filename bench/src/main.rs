@@ -1,26 +1,28 @@
 //! Figures of midshift beside the raw limits of the same machine in the same run: `cargo run --release -p midshift-bench -- NAME --json FILE`.
 
-mod bare;
 mod child;
+mod durable_baseline;
 mod edge;
 mod engine;
 mod figure;
-mod flood;
 mod fsync;
 mod gates;
-mod hall;
+mod grid_map;
 mod link;
 mod listen;
 mod offer;
 mod old_store;
 mod ota;
+mod outcome;
 mod plan;
 mod questions;
-mod raw;
 mod robot;
-mod sink;
+mod roles;
+mod saturation;
+mod session_baseline;
 mod stop;
 mod submit;
+mod unary_baseline;
 mod watch;
 
 use clap::{Parser, Subcommand};
@@ -50,7 +52,7 @@ enum Name {
     Watch(watch::WatchArgs),
     /// What the other names start: this program in one role.
     #[command(hide = true)]
-    Child(child::ChildArgs),
+    Child(roles::ChildArgs),
 }
 
 /// Measures one part of midshift. Prints the truth; there are no thresholds.
@@ -91,7 +93,7 @@ fn main() -> anyhow::Result<()> {
             told.figures
         }
         Name::Watch(args) => wait(watch::run(args, &note))?,
-        Name::Child(args) => return child::play(args),
+        Name::Child(args) => return roles::play(args),
     };
     print!("{}", figure::table(&figures));
     if let Some(path) = args.json {

@@ -2,8 +2,8 @@
 
 use crate::engine::{Engine, EngineArgs};
 use crate::figure::{Figure, percentile};
-use crate::hall;
-use crate::robot::{self, Ear, Voice};
+use crate::grid_map;
+use crate::robot::{self, RobotReceiver, RobotSender};
 use crate::submit::transports;
 use anyhow::{Context, ensure};
 use midshift_core::ids::WaypointId;
@@ -47,7 +47,7 @@ pub async fn run(args: OfferArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figu
 
 async fn on(args: &OfferArgs, engine: &Engine) -> anyhow::Result<Vec<Figure>> {
     let bed = engine.bed(args.engine.dir.as_ref())?;
-    let map = hall::map(bed.path(), SIDE)?;
+    let map = grid_map::write(bed.path(), SIDE)?;
     let site = grid::parse_map("bench", &std::fs::read_to_string(&map)?)?;
     let requests = transports(&site, args.submits * args.rounds)?;
     let server = bed.serve(Some(&map), None).await?;
@@ -55,7 +55,7 @@ async fn on(args: &OfferArgs, engine: &Engine) -> anyhow::Result<Vec<Figure>> {
     let mut robot = Idle::attach(&server.address.to_string(), "rbt-1", here).await?;
     let mut client = TaskServiceClient::new(server.channel().await?);
     let (mut offered, mut durable, mut raws) = (Vec::new(), Vec::new(), Vec::new());
-    let mut raw = bed.raw().await?;
+    let mut baseline = bed.baseline().await?;
     for (round, requests) in requests.chunks(args.submits.max(1)).enumerate() {
         let (mut to_robot, mut to_client, mut by_itself) = (Vec::new(), Vec::new(), Vec::new());
         for (number, request) in requests.iter().enumerate() {
@@ -63,7 +63,7 @@ async fn on(args: &OfferArgs, engine: &Engine) -> anyhow::Result<Vec<Figure>> {
             let (robot_ms, client_ms) = one(&mut client, &mut robot, request).await?;
             to_robot.push(robot_ms);
             to_client.push(client_ms);
-            by_itself.push(raw.ms().await?);
+            by_itself.push(baseline.measure_ms().await?);
         }
         offered.push(to_robot);
         durable.push(to_client);
@@ -77,10 +77,10 @@ async fn on(args: &OfferArgs, engine: &Engine) -> anyhow::Result<Vec<Figure>> {
     let told_allowed = format!("3 x {told_p50} + 5 ms");
     let answered = format!("submit to its durable answer, p50{}", engine.suffix());
     Ok(vec![
-        Figure::of("P5", name("p50"), "ms", &each(&offered, 0.5), Some((&told_allowed, &allowed))),
-        Figure::of("P5", name("p50, by the raw limit"), "ms", &each(&offered, 0.5), Some((&told_p50, &p50))),
-        Figure::of("P5", name("p99, by the raw limit"), "ms", &each(&offered, 0.99), Some((&told_p99, &p99))),
-        Figure::of("P5", answered, "ms", &each(&durable, 0.5), Some((&told_p50, &p50))),
+        Figure::new("P5", name("p50"), "ms", &each(&offered, 0.5), Some((&told_allowed, &allowed))),
+        Figure::new("P5", name("p50, by the raw limit"), "ms", &each(&offered, 0.5), Some((&told_p50, &p50))),
+        Figure::new("P5", name("p99, by the raw limit"), "ms", &each(&offered, 0.99), Some((&told_p99, &p99))),
+        Figure::new("P5", answered, "ms", &each(&durable, 0.5), Some((&told_p50, &p50))),
     ])
 }
 
@@ -109,15 +109,15 @@ pub async fn one(
 
 /// A robot that does everything in no time.
 pub struct Idle {
-    voice: Voice,
-    ear: Ear,
+    sender: RobotSender,
+    receiver: RobotReceiver,
 }
 
 impl Idle {
     /// A new one at a waypoint, which the server knows to be idle.
     pub async fn attach(server: &str, name: &str, here: WaypointId) -> anyhow::Result<Self> {
-        let (voice, ear, _) = robot::attach(server, name, Some(here)).await?;
-        let mut robot = Self { voice, ear };
+        let (sender, receiver, _) = robot::attach(server, name, Some(here)).await?;
+        let mut robot = Self { sender, receiver };
         robot.known_idle().await?;
         Ok(robot)
     }
@@ -134,14 +134,14 @@ impl Idle {
         beat.reset();
         loop {
             tokio::select! {
-                down = self.ear.hear() => {
+                down = self.receiver.receive() => {
                     let Some(work) = down?.work else { continue };
-                    self.voice.reported.applied_work = work.generation;
+                    self.sender.reported.applied_work = work.generation;
                     if let Some(assignment) = work.assignment {
                         return Ok(assignment);
                     }
                 }
-                _ = beat.tick() => self.voice.beat(false).await?,
+                _ = beat.tick() => self.sender.beat(false).await?,
             }
         }
     }
@@ -159,10 +159,10 @@ impl Idle {
             })
         };
         let steps = assignment.steps.len() as u32;
-        self.voice.tell(vec![report(WorkState::Accepted, 0), report(WorkState::Succeeded, steps)]).await?;
+        self.sender.send_events(vec![report(WorkState::Accepted, 0), report(WorkState::Succeeded, steps)]).await?;
         loop {
-            let Some(work) = self.ear.hear().await?.work else { continue };
-            self.voice.reported.applied_work = work.generation;
+            let Some(work) = self.receiver.receive().await?.work else { continue };
+            self.sender.reported.applied_work = work.generation;
             if work.assignment.is_none_or(|still| still.attempt != assignment.attempt) {
                 return self.known_idle().await;
             }
@@ -170,12 +170,12 @@ impl Idle {
     }
     /// Beats, and waits until that beat is processed.
     async fn known_idle(&mut self) -> anyhow::Result<()> {
-        self.voice.beat(false).await?;
-        let hb = self.voice.reported.hb;
+        self.sender.beat(false).await?;
+        let hb = self.sender.reported.hb;
         loop {
-            let down = self.ear.hear().await?;
+            let down = self.receiver.receive().await?;
             if let Some(work) = &down.work {
-                self.voice.reported.applied_work = work.generation;
+                self.sender.reported.applied_work = work.generation;
             }
             if down.echo.is_some_and(|echo| echo.hb == hb) {
                 return Ok(());

@@ -6,7 +6,7 @@
 use crate::child::Child;
 use crate::engine::{Bed, Engine, EngineArgs};
 use crate::figure::{Figure, percentile};
-use crate::hall;
+use crate::grid_map;
 use crate::offer::{Idle, one};
 use crate::submit::transports;
 use anyhow::{Context, ensure};
@@ -88,7 +88,7 @@ fn told(args: &OldArgs, engine: &Engine, ended: u64, rounds: &Rounds, empty: &Ro
     let raw = Some((engine.limit(), rounds.raw_ms.as_slice()));
     let beside = |of: fn(&Rounds) -> &Vec<f64>| Some(("of an empty store", of(empty).as_slice()));
     let of_server =
-        |what: &str, unit, of: fn(&Rounds) -> &Vec<f64>| Figure::of("P6", name(what), unit, of(rounds), beside(of));
+        |what: &str, unit, of: fn(&Rounds) -> &Vec<f64>| Figure::new("P6", name(what), unit, of(rounds), beside(of));
     let mut figures = vec![
         of_server("start to ready", "ms", |r| &r.ready_ms),
         of_server("ready to a robot's first offer", "ms", |r| &r.offer_ms),
@@ -102,7 +102,7 @@ fn told(args: &OldArgs, engine: &Engine, ended: u64, rounds: &Rounds, empty: &Ro
         for (share, of) in [(0.5, "p50"), (0.99, "p99"), (1.0, "max")] {
             let values: Vec<f64> = asked.iter().map(|round| percentile(round, share)).collect();
             let name = name(&format!("{robots} robots, {live} tasks, {what}, {of}"));
-            figures.push(Figure::of("P6", name, "ms", &values, raw));
+            figures.push(Figure::new("P6", name, "ms", &values, raw));
         }
     }
     figures
@@ -110,7 +110,7 @@ fn told(args: &OldArgs, engine: &Engine, ended: u64, rounds: &Rounds, empty: &Ro
 
 async fn rounds(args: &OldArgs, engine: &Engine, ended: u64, say: &dyn Fn(&str)) -> anyhow::Result<Rounds> {
     let bed = engine.bed(args.engine.dir.as_ref())?;
-    let map = hall::map(bed.path(), SIDE)?;
+    let map = grid_map::write(bed.path(), SIDE)?;
     let site = grid::parse_map("bench", &std::fs::read_to_string(&map)?)?;
     let loaded = midshift_cli::site_file::load(Some(&map), None, None)?;
     if ended > 0 {
@@ -168,7 +168,7 @@ async fn bed_raw_ms(bed: &Bed<'_>, round: usize) -> anyhow::Result<Vec<f64>> {
     if round > 0 {
         return Ok(Vec::new());
     }
-    bed.raw().await?.several_ms(APPENDS).await
+    bed.baseline().await?.several_ms(APPENDS).await
 }
 
 /// Ends the server that plans as if its power went, beside one that stands by: until that one gives its first offer.

@@ -106,13 +106,13 @@ fn cycles(args: &PlanArgs) -> anyhow::Result<Vec<Figure>> {
         }
         let beside: Option<(&str, &[f64])> = Some(("fixed reference loop", &reference));
         let what = format!("whole cycle, {robots} idle robots, {} tasks", waiting(robots));
-        figures.push(Figure::of("P6", format!("{what}, p50"), "ms", &known, beside));
-        figures.push(Figure::of("P6", format!("{what}, p99"), "ms", &[percentile(&known, 0.99)], beside));
-        figures.push(Figure::of("P6", format!("{what}, no way known yet"), "ms", &new, beside));
+        figures.push(Figure::new("P6", format!("{what}, p50"), "ms", &known, beside));
+        figures.push(Figure::new("P6", format!("{what}, p99"), "ms", &[percentile(&known, 0.99)], beside));
+        figures.push(Figure::new("P6", format!("{what}, no way known yet"), "ms", &new, beside));
         let what = format!("whole cycle, {robots} robots of low charge, one charger, {} tasks", waiting(robots));
-        figures.push(Figure::of("P6", what, "ms", &low, beside));
+        figures.push(Figure::new("P6", what, "ms", &low, beside));
         let what = format!("whole cycle, {robots} idle robots, {} tasks whose time is later", robots * BLOCKED_EACH);
-        figures.push(Figure::of("P6", what, "ms", &blocked, beside));
+        figures.push(Figure::new("P6", what, "ms", &blocked, beside));
     }
     Ok(figures)
 }

@@ -10,16 +10,17 @@ pub fn answer_questions(
     stop: CancellationToken,
     answer: impl Fn(&str) -> u64 + Send + 'static,
 ) -> anyhow::Result<()> {
-    say(&address.to_string())?;
+    print_line(&address.to_string())?;
     tokio::task::spawn_blocking(move || {
-        let told = std::io::stdin().lines().map_while(Result::ok).try_for_each(|line| say(&answer(&line).to_string()));
+        let told =
+            std::io::stdin().lines().map_while(Result::ok).try_for_each(|line| print_line(&answer(&line).to_string()));
         stop.cancel();
         told
     });
     Ok(())
 }
 
-fn say(line: &str) -> std::io::Result<()> {
+fn print_line(line: &str) -> std::io::Result<()> {
     let mut out = std::io::stdout().lock();
     writeln!(out, "{line}")?;
     out.flush()

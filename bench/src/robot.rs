@@ -19,14 +19,14 @@ use tonic::Streaming;
 const OUTBOUND: usize = 64;
 
 /// The way up of one robot.
-pub struct Voice {
+pub struct RobotSender {
     up: mpsc::Sender<SessionRequest>,
     /// What it says of itself; the numbers are kept here.
     pub reported: ReportedState,
 }
 
 /// The way down of one robot.
-pub struct Ear(Streaming<SessionResponse>);
+pub struct RobotReceiver(Streaming<SessionResponse>);
 
 /// What a new robot at a waypoint says first.
 pub fn hello(name: &str, waypoint: Option<WaypointId>) -> anyhow::Result<Hello> {
@@ -41,12 +41,16 @@ pub fn hello(name: &str, waypoint: Option<WaypointId>) -> anyhow::Result<Hello> 
 }
 
 /// Opens a session for a new robot at a waypoint.
-pub async fn attach(server: &str, name: &str, waypoint: Option<WaypointId>) -> anyhow::Result<(Voice, Ear, Welcome)> {
+pub async fn attach(
+    server: &str,
+    name: &str,
+    waypoint: Option<WaypointId>,
+) -> anyhow::Result<(RobotSender, RobotReceiver, Welcome)> {
     open(server, hello(name, waypoint)?).await
 }
 
 /// Opens a session.
-pub async fn open(server: &str, hello: Hello) -> anyhow::Result<(Voice, Ear, Welcome)> {
+pub async fn open(server: &str, hello: Hello) -> anyhow::Result<(RobotSender, RobotReceiver, Welcome)> {
     let channel = TcpDial::new(&midshift_cli::way::uri(server), None)?.dial().await?;
     let (up, outbound) = mpsc::channel(OUTBOUND);
     let reported = hello.reported.clone();
@@ -58,12 +62,12 @@ pub async fn open(server: &str, hello: Hello) -> anyhow::Result<(Voice, Ear, Wel
         Ok(other) => bail!("not a welcome: {other:?}"),
         Err(refusal) => bail!("not a welcome: {refusal}"),
     };
-    let mut voice = Voice { up, reported };
-    voice.reported.session_epoch = welcome.session_epoch;
-    Ok((voice, Ear(down), welcome))
+    let mut sender = RobotSender { up, reported };
+    sender.reported.session_epoch = welcome.session_epoch;
+    Ok((sender, RobotReceiver(down), welcome))
 }
 
-impl Voice {
+impl RobotSender {
     /// A heartbeat, alone or with the next STATUS sample.
     pub async fn beat(&mut self, with_status: bool) -> anyhow::Result<()> {
         let body = with_status.then(|| SampleBody::Status(self.reported.vitals.clone()));
@@ -71,16 +75,16 @@ impl Voice {
         self.reported.hb += 1;
         let sent_unix_us = midshift_agent::clock::wall().0 * 1000;
         let heartbeat = Some(Heartbeat { reported: self.reported.clone(), sent_unix_us, clock: None });
-        self.say(Uplink { heartbeat, batches }).await
+        self.send_uplink(Uplink { heartbeat, batches }).await
     }
     /// The next EVENT samples, in one message.
-    pub async fn tell(&mut self, events: Vec<RobotEvent>) -> anyhow::Result<()> {
+    pub async fn send_events(&mut self, events: Vec<RobotEvent>) -> anyhow::Result<()> {
         let batch = self.batch(Lane::Event, events.into_iter().map(SampleBody::Event).collect());
-        self.say(Uplink { heartbeat: None, batches: vec![batch] }).await
+        self.send_uplink(Uplink { heartbeat: None, batches: vec![batch] }).await
     }
     /// A small event that changes nothing.
-    pub async fn tell_mode(&mut self) -> anyhow::Result<()> {
-        self.tell(vec![RobotEvent::Mode(Mode::Automatic)]).await
+    pub async fn send_mode(&mut self) -> anyhow::Result<()> {
+        self.send_events(vec![RobotEvent::Mode(Mode::Automatic)]).await
     }
     /// What one STATUS message takes of the credit, bytes.
     pub fn status_bytes(&self) -> usize {
@@ -101,14 +105,14 @@ impl Voice {
         };
         LaneBatch { lane, items: bodies.into_iter().map(number).collect() }
     }
-    async fn say(&self, uplink: Uplink) -> anyhow::Result<()> {
+    async fn send_uplink(&self, uplink: Uplink) -> anyhow::Result<()> {
         self.up.send((&FromRobot::Uplink(uplink)).into()).await.context("the session has ended")
     }
 }
 
-impl Ear {
+impl RobotReceiver {
     /// The next word from the server; an error if the session is over.
-    pub async fn hear(&mut self) -> anyhow::Result<Box<Downlink>> {
+    pub async fn receive(&mut self) -> anyhow::Result<Box<Downlink>> {
         let message = self.0.message().await?.context("the server ended the session")?;
         match midshift_proto::parse(message) {
             Ok(ToRobot::Downlink(down)) => Ok(down),
@@ -119,7 +123,7 @@ impl Ear {
     /// Up to which number of a lane all is durable, as soon as the server says something of it.
     pub async fn acked(&mut self, lane: Lane) -> anyhow::Result<u64> {
         loop {
-            let down = self.hear().await?;
+            let down = self.receive().await?;
             if let Some(ack) = down.acks.iter().rev().find(|ack| ack.lane == lane) {
                 return match ack.expect {
                     None => Ok(ack.seq),

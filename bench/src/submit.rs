@@ -98,13 +98,13 @@ async fn round(
     requests: &Arc<Vec<SubmitTaskRequest>>,
     bytes: usize,
 ) -> anyhow::Result<Round> {
-    let mut raw = bed.raw().await?;
-    let mut raw_ms = raw.several_ms(args.fsyncs / 2).await?;
+    let mut baseline = bed.baseline().await?;
+    let mut raw_ms = baseline.several_ms(args.fsyncs / 2).await?;
     let before_s = engine.cpu_s()?;
     let load = load(server, requests, args.requests, args.in_flight).await?;
     let calls = (args.requests + warm(args.requests)) as f64;
     let database_us = engine.cpu_s()?.zip(before_s).map(|(after_s, before_s)| (after_s - before_s) * 1e6 / calls);
-    raw_ms.extend(raw.several_ms(args.fsyncs / 2).await?);
+    raw_ms.extend(baseline.several_ms(args.fsyncs / 2).await?);
     let copied_per_s = bed.copied_per_s(args.requests, bytes, args.in_flight).await?;
     Ok(Round { load, raw_ms, database_us, copied_per_s })
 }
@@ -114,12 +114,12 @@ fn figures(in_flight: usize, engine: &Engine, ours: &[Round], bare: &[Load]) -> 
     let each = |what: fn(&Load) -> f64| ours.iter().map(|round| what(&round.load)).collect::<Vec<_>>();
     let beside_bare = |what: &str, unit, of: fn(&Load) -> f64| {
         let limit: Vec<f64> = bare.iter().map(of).collect();
-        Figure::of("P5", name(what), unit, &each(of), Some(("bare tonic unary, same messages", &limit)))
+        Figure::new("P5", name(what), unit, &each(of), Some(("bare tonic unary, same messages", &limit)))
     };
     let beside_raw = |what: &str, share: f64, of: fn(&Load) -> f64| {
         let limit: Vec<f64> = ours.iter().map(|round| percentile(&round.raw_ms, share)).collect();
         let told = format!("{}, {what}", engine.limit());
-        Figure::of("P5", name(&format!("{what}, by the raw limit")), "ms", &each(of), Some((&told, &limit)))
+        Figure::new("P5", name(&format!("{what}, by the raw limit")), "ms", &each(of), Some((&told, &limit)))
     };
     let mut figures = vec![
         beside_bare("server CPU each", "us", |l| l.cpu_us),
@@ -133,12 +133,18 @@ fn figures(in_flight: usize, engine: &Engine, ours: &[Round], bare: &[Load]) -> 
     let copied: Vec<f64> = ours.iter().filter_map(|round| round.copied_per_s).collect();
     if !copied.is_empty() {
         let told = format!("COPY of rows of that size, {in_flight} a commit");
-        figures.push(Figure::of("P5", name("rate, by COPY"), "1/s", &each(|l| l.per_s), Some((&told, &copied))));
+        figures.push(Figure::new("P5", name("rate, by COPY"), "1/s", &each(|l| l.per_s), Some((&told, &copied))));
     }
     let database_us: Vec<f64> = ours.iter().filter_map(|round| round.database_us).collect();
     if !database_us.is_empty() {
         let limit = ("midshift's own", each(|l| l.cpu_us));
-        figures.push(Figure::of("P5", name("CPU of the database each"), "us", &database_us, Some((limit.0, &limit.1))));
+        figures.push(Figure::new(
+            "P5",
+            name("CPU of the database each"),
+            "us",
+            &database_us,
+            Some((limit.0, &limit.1)),
+        ));
     }
     figures
 }

@@ -4,7 +4,7 @@
 use crate::child::{Child, SESSIONS};
 use crate::engine::{Engine, EngineArgs};
 use crate::figure::Figure;
-use crate::hall;
+use crate::grid_map;
 use anyhow::{Context, ensure};
 use midshift_core::limits;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
@@ -65,16 +65,16 @@ pub async fn run(args: WatchArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figu
         };
         let without: Option<(&str, &[f64])> = Some(("without them", &memory.without));
         let more: Vec<f64> = memory.most.iter().zip(&memory.without).map(|(most, without)| most - without).collect();
-        figures.push(Figure::of("watch", what("memory of the server, at most"), "KiB", &memory.most, without));
-        figures.push(Figure::of("watch", what("of it more than before"), "KiB", &more, without));
-        figures.push(Figure::of("watch", what("memory when they have ended"), "KiB", &memory.after, without));
+        figures.push(Figure::new("watch", what("memory of the server, at most"), "KiB", &memory.most, without));
+        figures.push(Figure::new("watch", what("of it more than before"), "KiB", &more, without));
+        figures.push(Figure::new("watch", what("memory when they have ended"), "KiB", &memory.after, without));
     }
     Ok(figures)
 }
 
 async fn round(args: &WatchArgs, engine: &Engine, memory: &mut Memory) -> anyhow::Result<()> {
     let bed = engine.bed(args.engine.dir.as_ref())?;
-    let map = hall::map(bed.path(), (args.robots as f64).sqrt() as usize + 2)?;
+    let map = grid_map::write(bed.path(), (args.robots as f64).sqrt() as usize + 2)?;
     let mut server = bed.serve(Some(&map), None).await?;
     let (address, robots) = (server.address.to_string(), args.robots.to_string());
     let map = map.to_str().context("a path that is no text")?;

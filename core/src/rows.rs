@@ -166,19 +166,19 @@ impl Table {
 /// A stream of facts in commit order. Row changes go to the log of their writer; robots' events have one of their own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Log {
-    /// `task_event`.
+    /// Rows of task intake, in `task_event`.
     Task,
-    /// `fleet_event`.
+    /// Rows of fleet, in `fleet_event`.
     Fleet,
-    /// `telemetry_event`.
+    /// Rows of telemetry, in `telemetry_event`.
     Telemetry,
     /// `robot_inbox`: EVENT and CRITICAL of robots, acknowledged from here. Written by telemetry.
     RobotInbox,
-    /// `ota_event`.
+    /// Rows of software, in `ota_event`.
     Ota,
-    /// `stop_event`.
+    /// Copies of stops, in `stop_event`.
     Stop,
-    /// `identity_event`.
+    /// Rows of identity, in `identity_event`.
     Identity,
 }
 
@@ -317,7 +317,7 @@ pub struct Row {
     pub revision: Revision,
     /// Index columns.
     pub index: Index,
-    /// JSON.
+    /// What the row holds, as JSON.
     pub body: Arc<str>,
 }
 
@@ -387,7 +387,7 @@ pub enum Write {
     Put {
         /// Index columns.
         index: Index,
-        /// JSON.
+        /// What the row becomes, as JSON.
         body: Arc<str>,
     },
     /// It goes.
@@ -418,7 +418,7 @@ pub struct Fact {
     pub subject: Arc<str>,
     /// What happened.
     pub kind: &'static str,
-    /// JSON.
+    /// What is said of it, as JSON.
     pub body: Arc<str>,
 }
 

@@ -27,11 +27,11 @@ enum Found {
 /// # Errors
 /// A file that cannot be read; `InvalidData`: no whole copy is left.
 pub fn read(path: &Path) -> io::Result<Option<String>> {
-    let first = match look(path)? {
+    let first = match read_copy(path)? {
         Found::Whole(text) => return Ok(Some(text)),
         other => other,
     };
-    match (first, look(&copy_of(path))?) {
+    match (first, read_copy(&copy_of(path))?) {
         (_, Found::Whole(text)) => Ok(Some(text)),
         (Found::Missing, Found::Missing) => Ok(None),
         _ => Err(io::Error::new(io::ErrorKind::InvalidData, "the record is damaged, and no whole copy of it is left")),
@@ -45,7 +45,7 @@ pub fn read(path: &Path) -> io::Result<Option<String>> {
 /// If it could not be written: the old one or this is there. As [`read`]: what is damaged is not written over.
 pub fn write(path: &Path, text: &str) -> io::Result<()> {
     // The copy may be the only whole one: it does not go before the first is whole.
-    if !matches!(look(path)?, Found::Whole(_))
+    if !matches!(read_copy(path)?, Found::Whole(_))
         && let Some(before) = read(path)?
     {
         replace(path, seal(&before).as_bytes())?;
@@ -65,7 +65,7 @@ pub fn write(path: &Path, text: &str) -> io::Result<()> {
 pub fn mend(path: &Path) -> io::Result<()> {
     let Some(text) = read(path)? else { return Ok(()) };
     for file in [path, &copy_of(path)] {
-        match look(file)? {
+        match read_copy(file)? {
             Found::Whole(found) if found == text => {}
             _ => replace(file, seal(&text).as_bytes())?,
         }
@@ -83,7 +83,7 @@ pub fn seal(text: &str) -> String {
     format!("{text}{CHECK}{:016x}\n", check(text.as_bytes()))
 }
 
-fn look(path: &Path) -> io::Result<Found> {
+fn read_copy(path: &Path) -> io::Result<Found> {
     match fs::read(path) {
         Ok(bytes) => Ok(String::from_utf8(bytes).ok().and_then(opened).map_or(Found::Torn, Found::Whole)),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Found::Missing),

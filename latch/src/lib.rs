@@ -5,8 +5,10 @@
 //! anywhere leaves the value before it. Invariant: one writer at a time, held by a lock on the file; readers beside it need none.
 //! [`lock`] is for other files with one writer too. Used by the stop service and by robots for what must not be forgotten: which stops are engaged. Absent on purpose: everything else.
 
+mod error;
 mod slot;
 
+pub use error::Error;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use slot::Slot;
@@ -19,49 +21,6 @@ use std::time::Duration;
 /// Tries of a lock that somebody has, and the pause between two: a program that is being started runs within milliseconds.
 const LOCK_TRIES: u32 = 100;
 const LOCK_PAUSE: Duration = Duration::from_millis(10);
-
-/// What keeps a value from being kept or read.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The disk says no.
-    #[error("{doing} {path}: {source}", path = path.display())]
-    Io {
-        /// What was being done.
-        doing: &'static str,
-        /// The file.
-        path: PathBuf,
-        /// Why not.
-        source: io::Error,
-    },
-    /// Neither slot is whole: something else wrote to it, or the disk lost it.
-    #[error("{path} holds no whole value: move it away and look at it; a copy of it from before can be put in its place", path = path.display())]
-    Unreadable {
-        /// The file.
-        path: PathBuf,
-    },
-    /// Its newest value is of a form that this build does not know.
-    #[error("{path} holds what this build does not understand: {source}", path = path.display())]
-    Foreign {
-        /// The file.
-        path: PathBuf,
-        /// What of it.
-        source: serde_json::Error,
-    },
-    /// Another process writes it.
-    #[error("{path} is held by another process", path = path.display())]
-    Held {
-        /// The file.
-        path: PathBuf,
-    },
-    /// The value does not fit a slot.
-    #[error("{bytes} bytes do not fit a slot of {room} bytes")]
-    TooLarge {
-        /// What it takes.
-        bytes: usize,
-        /// What there is.
-        room: usize,
-    },
-}
 
 /// The file, open for writing.
 #[derive(Debug)]

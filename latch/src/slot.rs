@@ -1,6 +1,6 @@
 //! The bytes of one slot: a mark, the generation, the length, a checksum over both and the payload, then the payload.
 
-use crate::Error;
+use crate::error::Error;
 use crc::{CRC_64_XZ, Crc};
 use std::ops::RangeInclusive;
 

@@ -6,7 +6,7 @@
 mod roots;
 mod ways;
 
-pub use roots::WaitingRoot;
+pub use crate::roots::WaitingRoot;
 
 use crate::build::{self, inspect};
 use crate::digest::Digest;
@@ -18,6 +18,7 @@ use crate::repository::{
     sign_root, sign_targets, version_of,
 };
 use crate::roots::{Asked, merge_targets};
+use crate::ways::ways_to;
 use midshift_core::reason::{Refusal, Violations};
 use midshift_core::time::Utc;
 use std::collections::BTreeSet;
@@ -294,7 +295,7 @@ impl Folder {
         let lost = withdrawn.components.iter().map(|c| c.digest).filter(|digest| !kept.contains(digest)).collect();
         let previous = self.newest("targets")?.map(|(_, document)| document);
         let known = previous.as_deref().map(listed).transpose()?.unwrap_or_default();
-        gone.extend(ways::that_lead_to(&lost, &known).map(str::to_owned));
+        gone.extend(ways_to(&lost, &known).map(str::to_owned));
         let signed = sign_targets(previous.as_deref(), &[], &gone, now.plus_ms(PEOPLE_LIFE_MS), keys)?;
         Ok((withdrawn, self.put(&signed)?))
     }

@@ -149,7 +149,7 @@ const fn first_schema() -> (u32, u32) {
 pub struct Draft {
     /// `[a-z0-9-]`, 1-64.
     pub name: String,
-    /// `major.minor.patch`.
+    /// Its version, as `major.minor.patch`.
     pub version: String,
     /// For people.
     #[serde(default)]
@@ -170,7 +170,7 @@ pub struct Draft {
 pub struct Component {
     /// Unique in its bundle.
     pub name: String,
-    /// `major.minor.patch`.
+    /// Its version, as `major.minor.patch`.
     pub version: String,
     /// What it is.
     pub kind: ComponentKind,
@@ -229,11 +229,11 @@ impl Component {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
-    /// [`FORMAT`].
+    /// How it is laid out: [`FORMAT`].
     pub format: u32,
     /// The bundle.
     pub name: String,
-    /// `major.minor.patch`.
+    /// Its version, as `major.minor.patch`.
     pub version: String,
     /// For people.
     pub description: String,

@@ -238,9 +238,9 @@ fn target_name(name: &str) -> Result<tough::TargetName, Error> {
 /// Snapshot and timestamp of a repository.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Online {
-    /// `N.snapshot.json`.
+    /// The document `N.snapshot.json`.
     pub snapshot: Vec<u8>,
-    /// `timestamp.json`.
+    /// The document `timestamp.json`.
     pub timestamp: Vec<u8>,
 }
 

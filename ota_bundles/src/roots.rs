@@ -71,6 +71,21 @@ pub struct Change {
     pub threshold: Option<u64>,
 }
 
+/// A root on its way.
+#[derive(Clone, Debug)]
+pub struct WaitingRoot {
+    /// As it stands in `metadata/pending.root.json`.
+    pub document: Vec<u8>,
+    /// What it says.
+    pub draft: RootDraft,
+    /// Keys that have signed it.
+    pub signed_by: Vec<KeyId>,
+    /// Signatures that it lacks of the keys of the root before.
+    pub lacks_of_before: u64,
+    /// Signatures that it lacks of its own keys.
+    pub lacks_of_own: u64,
+}
+
 impl RootDraft {
     /// What a root says, to make the next one of it.
     ///

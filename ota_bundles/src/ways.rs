@@ -5,6 +5,8 @@
 //! file that it leads to. Called by `folder`, and by the server, which tells robots of those that are listed.
 
 use crate::digest::Digest;
+use crate::repository::FileTarget;
+use std::collections::BTreeSet;
 
 /// How a name ends that is the whole file, shorter.
 const WHOLE: &str = ".zst";
@@ -39,4 +41,10 @@ impl Way {
         };
         Some(way)
     }
+}
+
+/// Names of listed ways that lead to nothing once `gone` is listed no more.
+pub(crate) fn ways_to<'a>(gone: &BTreeSet<Digest>, known: &'a [FileTarget]) -> impl Iterator<Item = &'a str> {
+    let names = known.iter().map(|file| file.name.as_str());
+    names.filter(move |name| Way::of_target(name).is_some_and(|way| gone.contains(&way.to)))
 }

@@ -8,7 +8,7 @@ use midshift_core::overload::Class;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 
 /// What a path needs; none: nobody may ask for it.
-pub fn of(path: &str) -> Option<Access> {
+pub fn find(path: &str) -> Option<Access> {
     method(path).or_else(|| foreign(path))
 }
 
@@ -34,7 +34,7 @@ fn foreign(path: &str) -> Option<Access> {
 
 /// What is shed first; a path without a rule is the first to go.
 pub fn class(path: &str) -> Class {
-    of(path).map_or(Class::Bulk, |access| access.class)
+    find(path).map_or(Class::Bulk, |access| access.class)
 }
 
 /// Whether an answer to that path goes on for as long as its caller likes.
@@ -52,7 +52,7 @@ pub fn is_batch(path: &str) -> bool {
 /// # Errors
 /// Not signed in, not permitted, or nobody may.
 pub fn check(caller: &Caller, path: &str) -> Result<(), Refusal> {
-    match of(path) {
+    match find(path) {
         Some(access) => caller.may_call(access),
         None => match caller.who() {
             // The services say themselves what is not there.
@@ -103,7 +103,7 @@ mod tests {
 
     #[test]
     fn a_path_without_a_rule_is_for_nobody() {
-        assert_eq!(of("/midshift.task.v1.TaskService/DropAll"), None);
+        assert_eq!(find("/midshift.task.v1.TaskService/DropAll"), None);
         assert_eq!(check(&Caller::nobody(), "/elsewhere").expect_err("nobody").kind(), Kind::Unauthenticated);
         assert!(check(&Caller::nobody(), "/grpc.health.v1.Health/Check").is_ok());
         for closed in ["/metrics", "/grpc.health.v1.Health/Watch"] {

@@ -5,8 +5,20 @@
 
 #[path = "architecture/circles.rs"]
 mod circles;
+#[path = "architecture/logs.rs"]
+mod logs;
+#[path = "architecture/newer_words.rs"]
+mod newer_words;
 #[path = "architecture/pages.rs"]
 mod pages;
+#[path = "architecture/serde_types.rs"]
+mod serde_types;
+#[path = "architecture/source.rs"]
+mod source;
+#[path = "architecture/stored_keys.rs"]
+mod stored_keys;
+#[path = "architecture/tidy.rs"]
+mod tidy;
 #[path = "architecture/twins.rs"]
 mod twins;
 
@@ -17,7 +29,7 @@ use std::path::{Path, PathBuf};
 /// Tasks are spawned in a crate's `lib.rs`. Elsewhere only here, each for a reason.
 const SPAWNS: &[(&str, &str)] = &[
     ("services/telemetry/src/link.rs", "one task a session: it must outlive the handler that opened it"),
-    ("services/telemetry/src/misreads.rs", "one fact: the robot's stream may be gone before it is written"),
+    ("services/telemetry/src/facts.rs", "one fact: the robot's stream may be gone before it is written"),
     ("services/telemetry/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/task/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/identity/src/audit/grpc.rs", "one task an export or verification, ended by its reader or by shutdown"),
@@ -27,7 +39,7 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/stop/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/midshift/src/scenario.rs", "the binary makes releases for a story"),
     ("services/midshift/src/scenario/watch.rs", "the binary looks at robots while a story is played"),
-    ("services/midshift/src/backup/mod.rs", "files are copied and read beside the runtime's threads"),
+    ("services/midshift/src/backup/files.rs", "files are copied and read beside the runtime's threads"),
     ("services/midshift/src/stop_follower.rs", "files of the stop service are read beside the runtime's threads"),
     ("services/midshift/src/machines.rs", "the binary enrols many machines side by side and renews what they got"),
     ("services/midshift/src/stop/manager.rs", "a service manager that hangs must not hold up the stop service"),
@@ -73,92 +85,19 @@ const NAMES_KEPT: &[(&str, &str)] = &[
     ("DataFile", "a file of the data directory, beside its lock file"),
 ];
 
-/// Names of fields of the log that would be where something is, or what somebody has written.
-const TOLD: [&str; 30] = [
-    "pose",
-    "x",
-    "y",
-    "x_mm",
-    "y_mm",
-    "theta",
-    "theta_mrad",
-    "position",
-    "waypoint",
-    "places",
-    "vitals",
-    "reason",
-    "note",
-    "text",
-    "message",
-    "detail",
-    "why",
-    "comment",
-    "description",
-    "warning",
-    "problem",
-    "advice",
-    "rejection",
-    "refusal",
-    "body",
-    "event",
-    "labels",
-    "params",
-    "report",
-    "secret",
-];
-/// Fields of such a name, or shown whole, that are neither. Each for a reason.
-const LOGGED: &[(&str, &str, &str)] = &[
-    ("robot_agent/src/core/step.rs", "replayed", "numbers of samples"),
-    ("robot_agent/src/session/mod.rs", "why", "what the transport said, and sentences of this program"),
-    ("robot_agent/src/stop/line.rs", "why", "what the transport said, and sentences of this program"),
-    (
-        "robot_agent/src/core/stops.rs",
-        "why",
-        "which field of the link's stops breaks a rule, in the words of the decoder",
-    ),
-    ("robot_agent/src/core/stops.rs", "level", "one of four words"),
-    ("robot_agent/src/core/stops.rs", "stops", "ids"),
-    ("robot_agent/src/core/stops.rs", "awaiting_resume", "ids"),
-    ("robot_agent/src/core/update/beliefs.rs", "rejection", "one of a closed list of sentences about signed documents"),
-    ("robot_agent/src/core/update/beliefs.rs", "keys", "digests"),
-    ("robot_agent/src/core/update/integrity.rs", "sets", "digests"),
-    (
-        "robot_agent/src/core/update/integrity.rs",
-        "why",
-        "which file of a set has which digest, in sentences of this program",
-    ),
-    ("robot_agent/src/update/io.rs", "base", "a digest"),
-    ("robot_agent/src/core/update/results.rs", "why", "what the transport or a disk said"),
-    ("robot_agent/src/core/update/record.rs", "from", "one of a closed list of states"),
-    ("robot_agent/src/core/update/record.rs", "to", "one of a closed list of states"),
-    ("robot_agent/src/core/update/record.rs", "state", "one of a closed list of states"),
-    ("robot_sim/src/swarm.rs", "deed", "a word and an id"),
-    ("robot_sim/src/swarm.rs", "why", "what the operating system said of a program"),
-    ("services/fleet/src/reconcile.rs", "text", "the key of a row, and what could not be read of it"),
-    ("services/fleet/src/standby.rs", "text", "the key of a row, and what could not be read of it"),
-    ("services/midshift/src/dev.rs", "warning", "what the lint says of the site's own file"),
-    ("services/midshift/src/robots.rs", "deed", "a word and an id"),
-    ("services/midshift/src/serve.rs", "warning", "what the lint says of the site's own file"),
-    ("services/ota/src/repository.rs", "why", "one of a closed list of words"),
-    ("services/ota/src/repository.rs", "advice", "a sentence of this program"),
-    ("services/ota/src/repository/documents.rs", "problem", "what is wrong with a signed file"),
-    ("services/ota/src/rollouts/reconcile.rs", "text", "the key of a row, and what could not be read of it"),
-    ("services/ota/src/rollouts/standby.rs", "text", "the key of a row, and what could not be read of it"),
-    (
-        "services/midshift/src/stop/started.rs",
-        "why",
-        "a sentence of this program, or what the system said of a process",
-    ),
-    ("services/stop/src/acts.rs", "level", "one of four words"),
-    ("services/stop/src/opening.rs", "why", "a sentence of this program"),
-    ("services/telemetry/src/link.rs", "why", "which field breaks which rule, in the words of the decoder"),
-    ("services/telemetry/src/misreads.rs", "why", "which field breaks which rule, in the words of the decoder"),
-    ("services/telemetry/src/session.rs", "why", "which field breaks which rule, in the words of the decoder"),
-    ("services/telemetry/src/welcome.rs", "rejection", "one of a closed list of sentences about signed documents"),
-    ("services/midshift/src/logs.rs", "message", "the constant words of a line that was counted"),
-];
+const LINES_MAX: usize = 600;
 
-const LINES_MAX: usize = 800;
+/// Files that are still longer, below a folder, with how many of them there are. It only shrinks.
+const KNOWN_LONG: &[(&str, usize)] = &[
+    ("cli/", 3),
+    ("core/", 2),
+    ("proto/", 2),
+    ("robot_agent/", 7),
+    ("robot_sim/", 1),
+    ("services/midshift/", 1),
+    ("services/ota/", 2),
+    ("tests/", 3),
+];
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
@@ -390,8 +329,14 @@ fn a_service_names_no_writer_but_itself() {
 fn no_file_is_longer_than_a_person_reads() {
     let all: Vec<String> = ["rs", "proto", "sql"].into_iter().flat_map(|ext| files(".", ext)).collect();
     assert!(all.len() > 100);
-    let long = all.iter().map(|p| (p, read(p).lines().count())).filter(|(_, lines)| *lines > LINES_MAX);
-    assert_eq!(long.collect::<Vec<_>>(), []);
+    let written = all.into_iter().filter(|path| !path.contains("/golden/"));
+    let long = written.map(|p| (read(&p).lines().count(), p)).filter(|(lines, _)| *lines > LINES_MAX);
+    let mut long: Vec<(usize, String)> = long.collect();
+    for (folder, known) in KNOWN_LONG {
+        let here: Vec<_> = long.extract_if(.., |(_, path)| path.starts_with(folder)).collect();
+        assert_eq!(here.len(), *known, "below {folder}: split what came, or lower the number: {here:#?}");
+    }
+    assert_eq!(long, []);
 }
 
 #[test]
@@ -558,208 +503,6 @@ fn no_type_is_named_after_nothing() {
         assert!(is_empty_name(bad), "{bad}");
     }
     assert!(!is_empty_name("Database") && !is_empty_name("Informed"));
-}
-
-// --- what is logged
-
-/// What stands between the brackets of each call of a macro of tracing.
-fn logged(text: &str) -> Vec<String> {
-    let mut found = Vec::new();
-    for (at, _) in text.match_indices("tracing::") {
-        let Some((word, rest)) = text[at + "tracing::".len()..].split_once('(') else { continue };
-        if !word.ends_with('!') && word != "instrument" || word.contains(char::is_whitespace) {
-            continue;
-        }
-        let (mut depth, mut quoted, mut escaped) = (1, false, false);
-        let end = rest.find(|c: char| {
-            match c {
-                _ if escaped => escaped = false,
-                '\\' if quoted => escaped = true,
-                '"' => quoted = !quoted,
-                '(' | '[' | '{' if !quoted => depth += 1,
-                ')' | ']' | '}' if !quoted => depth -= 1,
-                _ => {}
-            }
-            depth == 0
-        });
-        found.push(rest[..end.unwrap_or(rest.len())].to_owned());
-    }
-    found
-}
-
-/// Arguments of one call, without those in brackets of their own.
-fn arguments(call: &str) -> Vec<String> {
-    let (mut depth, mut quoted, mut escaped, mut one, mut all) = (0, false, false, String::new(), Vec::new());
-    for c in call.chars() {
-        match c {
-            _ if escaped => escaped = false,
-            '\\' if quoted => escaped = true,
-            '"' => quoted = !quoted,
-            '(' | '[' | '{' if !quoted => depth += 1,
-            ')' | ']' | '}' if !quoted => depth -= 1,
-            ',' if !quoted && depth == 0 => {
-                all.push(std::mem::take(&mut one));
-                continue;
-            }
-            _ => {}
-        }
-        one.push(c);
-    }
-    all.push(one);
-    all.into_iter().map(|one| one.trim().to_owned()).filter(|one| !one.is_empty()).collect()
-}
-
-/// Fields of one call that tell where something is or what somebody has written: its name and how it is given.
-fn tells(call: &str) -> Vec<String> {
-    let mut found = Vec::new();
-    for argument in arguments(call) {
-        if argument.starts_with('"') {
-            // Made of what a program knows, not of what it was told: no text of anybody is put into it.
-            found.extend(argument.contains('{').then(|| "message".to_owned()));
-            continue;
-        }
-        let (name, value) =
-            argument.split_once('=').map_or(("", argument.as_str()), |(name, value)| (name.trim(), value.trim()));
-        let plain = value.trim_start_matches(['%', '?', '&']);
-        let name = if name.is_empty() { plain.rsplit('.').next().unwrap_or_default() } else { name };
-        let ends = [".code", ".code.as_str()", ".code.as_str())", "reason.name()", "reason.name())", "why.name()"];
-        let is_code = ends.iter().any(|end| plain.ends_with(end));
-        let is_place = [".pose", ".waypoint", ".text()", ".message", ".vitals"].iter().any(|part| plain.contains(part));
-        if is_place || !is_code && (TOLD.contains(&name) || value.starts_with('?')) {
-            found.push(name.to_owned());
-        }
-    }
-    found
-}
-
-#[test]
-fn logs_carry_ids_and_codes_and_never_where_something_is_or_what_somebody_wrote() {
-    let (mut calls, mut used) = (0, BTreeSet::new());
-    for room in [
-        "cli/src",
-        "core/src",
-        "proto/src",
-        "services",
-        "robot_agent/src",
-        "robot_sim/src",
-        "latch/src",
-        "ota_bundles/src",
-    ] {
-        for path in files(room, "rs").into_iter().filter(|p| p.contains("src/")) {
-            for call in logged(&code(&read(&path))) {
-                calls += 1;
-                for name in tells(&call) {
-                    let known = LOGGED.iter().find(|(file, field, _)| *file == path && *field == name);
-                    let known = known.unwrap_or_else(|| {
-                        panic!("{path} logs {name}: log its id or code, or say in this test why it is neither: {call}")
-                    });
-                    used.insert((known.0, known.1));
-                }
-            }
-        }
-    }
-    assert!(calls > 100, "only {calls} calls were looked at");
-    let unused: Vec<_> = LOGGED.iter().filter(|(file, name, _)| !used.contains(&(*file, *name))).collect();
-    assert!(unused.is_empty(), "strike what is not logged any more: {unused:?}");
-}
-
-#[test]
-fn a_place_or_a_text_in_the_log_is_found_however_it_is_given() {
-    let found = |text: &str| logged(text).iter().flat_map(|call| tells(call)).collect::<Vec<_>>();
-    assert_eq!(found("tracing::info!(robot_id = %r.robot_id, pose = ?v.pose, \"moved\");"), ["pose"]);
-    assert_eq!(found("tracing::warn!(%robot_id, at = vitals.pose.x_mm, \"stands\");"), ["at"]);
-    assert_eq!(found("tracing::info!(%request.reason, \"cordoned\")"), ["reason"]);
-    assert_eq!(found("tracing::info!(cause = refusal.reason.text(), \"refused\")"), ["cause"]);
-    assert_eq!(found("tracing::info!(?report, \"said\")"), ["report"]);
-    assert_eq!(found("tracing::error!(\"{reason}: no, {text}\")"), ["message"]);
-    assert_eq!(found("#[tracing::instrument(note)] fn f() {}"), ["note"]);
-    let fine =
-        "tracing::warn!(%task_id, reason = why.code.as_str(), n = list.len(), error = %x(1, \")\"), \"told, once\");";
-    assert_eq!(found(fine), Vec::<String>::new());
-}
-
-// --- words of a newer version
-
-/// What this build does with a word of a newer version where such an enum is read.
-const WORDS: &[(&str, &[&str])] = &[
-    // Kept in the value itself.
-    ("kept", &["FaultClass", "WorkState"]),
-    // The row stands aside: core/src/unknown_rows.rs. A robot's ledger and what lies in an inbox are its own to refuse.
-    (
-        "aside",
-        &[
-            "AttemptPhase",
-            "DrainState",
-            "Duty",
-            "Effect",
-            "Ending",
-            "Errand",
-            "Goal",
-            "HardwareStop",
-            "HolderState",
-            "InboxItem",
-            "Lane",
-            "Mode",
-            "Outcome",
-            "Pause",
-            "Phase",
-            "PlaceNews",
-            "Presence",
-            "ReleasedBy",
-            "Resolution",
-            "RobotEvent",
-            "RobotHolder",
-            "SampleBody",
-            "Scope",
-            "Step",
-            "StepKind",
-            "StopLevel",
-            "Subject",
-            "Suspicion",
-            "Then",
-            "TimerKind",
-            "UpdateEvent",
-            "UpdateState",
-            "Verdict",
-        ],
-    ),
-    // A person or a program asks for it, or a file says it: refused, and the field is named.
-    (
-        "refused",
-        &[
-            "AbortScope",
-            "Ask",
-            "Command",
-            "Kind",
-            "Revocation",
-            "Rule",
-            "SmallWave",
-            "SmallWaveFailure",
-            "Source",
-            "Verb",
-            "Wave",
-            "Ways",
-        ],
-    ),
-];
-
-#[test]
-fn every_enum_that_is_read_from_rows_has_a_decision_for_words_of_a_newer_version() {
-    let mut found = std::collections::BTreeSet::new();
-    for path in files("core/src", "rs") {
-        let text = read(&path);
-        let mut derives = false;
-        for line in text.lines().map(str::trim_start) {
-            derives |= line.starts_with("#[derive(") && line.contains("Deserialize");
-            let name = line.strip_prefix("pub ").unwrap_or(line).strip_prefix("enum ");
-            if let Some(name) = name.filter(|_| derives) {
-                found.insert(name.trim_end_matches([' ', '{']).to_owned());
-            }
-            derives &= line.starts_with("#[") || line.starts_with("//");
-        }
-    }
-    let decided = WORDS.iter().flat_map(|(_, names)| names.iter().map(|name| (*name).to_owned())).collect();
-    assert_eq!(found, decided, "an enum of core that is read has no decision, or is gone");
 }
 
 #[test]

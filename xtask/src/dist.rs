@@ -83,7 +83,10 @@ pub fn dist(workspace: &Workspace, options: &Options) -> Result<bool> {
     for line in std::fs::read_to_string(to.join("SHA256SUMS")).context("reading digests")?.lines() {
         run::print(line);
     }
-    run::say(&format!("in {}; next: tag the commit v{version}, sign SHA256SUMS, publish the folder", to.display()));
+    run::print_line(&format!(
+        "in {}; next: tag the commit v{version}, sign SHA256SUMS, publish the folder",
+        to.display()
+    ));
     Ok(true)
 }
 
@@ -216,7 +219,7 @@ fn digests(folder: &Path) -> Result<()> {
     std::fs::write(folder.join("SHA256SUMS"), said).context("writing digests")
 }
 
-/// `midshift-VERSION-ARCHITECTURE-SYSTEM`.
+/// The name of an archive: `midshift-VERSION-ARCHITECTURE-SYSTEM`.
 fn name_of(version: &str) -> String {
     format!("midshift-{version}-{}-{}", std::env::consts::ARCH, std::env::consts::OS)
 }

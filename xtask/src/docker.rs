@@ -3,6 +3,7 @@
 //! Invariant: the daemon has its files, its socket and its networks apart from any other, is ended by its id, and leaves nothing but what is cached
 //! nowhere. It is not skipped: where docker cannot run the part fails, unless the suite was told `--no-docker`.
 
+use crate::stack::site::{PORTS, Site, submit_task};
 use crate::workspace::Workspace;
 use crate::{apt, images, run, stack};
 use anyhow::{Context, Result, bail, ensure};
@@ -82,7 +83,7 @@ impl Daemon {
             let daemon = Self::start_with(folder, driver)?;
             match daemon {
                 Ok(daemon) => return Ok(daemon),
-                Err(said) => run::say(&format!("dockerd with {driver} does not start:\n{said}")),
+                Err(said) => run::print_line(&format!("dockerd with {driver} does not start:\n{said}")),
             }
         }
         bail!(
@@ -136,7 +137,7 @@ impl Daemon {
 
 impl Drop for Daemon {
     fn drop(&mut self) {
-        stack::send(self.child.id(), "TERM");
+        stack::send_signal(self.child.id(), "TERM");
         for _ in 0..LOOKS {
             if self.child.try_wait().is_ok_and(|status| status.is_some()) {
                 return;
@@ -193,7 +194,7 @@ pub fn test(workspace: &Workspace, midshift: &Path) -> Result<bool> {
 fn stacks(daemon: &Daemon, workspace: &Workspace, temporary: &Path, midshift: &Path) -> Result<bool> {
     let images = images::make(&|| daemon.docker(), temporary, &workspace.root, midshift)?;
     for stack in &STACKS {
-        run::say(stack.file);
+        run::print_line(stack.file);
         if !works(stack, daemon, workspace, temporary, &images, midshift)? {
             return Ok(false);
         }
@@ -209,7 +210,7 @@ fn works(
     images: &images::Images,
     midshift: &Path,
 ) -> Result<bool> {
-    let held = stack::PORTS.map(|name| (name, TcpListener::bind("127.0.0.1:0")));
+    let held = PORTS.map(|name| (name, TcpListener::bind("127.0.0.1:0")));
     let mut ports = Vec::new();
     for (name, listener) in &held {
         let listener = listener.as_ref().map_err(|e| anyhow::anyhow!("a free port: {e}"))?;
@@ -230,7 +231,7 @@ fn works(
     // It waits for health where the file says so: the robots start last, after the proxy, after everything else.
     let done = run::succeeds(&mut compose(&["up", "-d", "--no-build"]))?
         && all_healthy(daemon, stack)?
-        && crate::stack::task(workspace, midshift, &public, &site(stack, daemon, temporary, &compose)?)?;
+        && submit_task(workspace, midshift, &public, &site(stack, daemon, temporary, &compose)?)?;
     if !done {
         run::succeeds(&mut compose(&["ps"]))?;
         run::succeeds(&mut compose(&["logs", "--no-color", "--tail", "20"]))?;
@@ -239,9 +240,9 @@ fn works(
 }
 
 /// What a person would take out of the stack to sign in.
-fn site(stack: &Stack, daemon: &Daemon, to: &Path, compose: &dyn Fn(&[&str]) -> Command) -> Result<crate::stack::Site> {
+fn site(stack: &Stack, daemon: &Daemon, to: &Path, compose: &dyn Fn(&[&str]) -> Command) -> Result<Site> {
     let id = run::output(&mut compose(&["ps", "-q", stack.identity])).context("docker-compose ps")?;
-    let site = crate::stack::Site { root: to.join("ca.pem"), token: to.join("token") };
+    let site = Site { root: to.join("ca.pem"), token: to.join("token") };
     for (from, to) in [("site/ca.pem", &site.root), ("token/token", &site.token)] {
         let from = format!("{}:/var/lib/midshift-{from}", id.trim());
         ensure!(run::succeeds(daemon.docker().args(["cp", &from]).arg(to))?, "{from} cannot be copied");
@@ -258,6 +259,6 @@ fn all_healthy(daemon: &Daemon, stack: &Stack) -> Result<bool> {
         up += usize::from(line.contains(" Up "));
         healthy += usize::from(line.ends_with("(healthy)"));
     }
-    run::say(&format!("{up} containers are up, {healthy} of them say that they are healthy"));
+    run::print_line(&format!("{up} containers are up, {healthy} of them say that they are healthy"));
     Ok(up == stack.containers && healthy == stack.asked)
 }

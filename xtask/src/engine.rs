@@ -30,7 +30,7 @@ const AGAIN: &[(&str, &str)] = &[
 pub fn selection() -> Vec<&'static str> {
     let mut selection = vec!["--test", "e2e", "--"];
     for (name, why) in AGAIN {
-        run::say(&format!("again on PostgreSQL: {name}*: {why}"));
+        run::print_line(&format!("again on PostgreSQL: {name}*: {why}"));
         selection.push(name);
     }
     selection

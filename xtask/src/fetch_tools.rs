@@ -29,9 +29,9 @@ const POSTGRESQL_MIN: u32 = 15;
 
 /// Paths of the tools.
 pub struct Tools {
-    /// grpcurl.
+    /// The program grpcurl.
     pub grpcurl: PathBuf,
-    /// buf.
+    /// The program buf.
     pub buf: PathBuf,
     /// A Python that can import grpc, grpc_tools and tuf.
     pub python: PathBuf,
@@ -47,7 +47,7 @@ pub struct Tools {
 
 impl Tools {
     /// Where they are or will be.
-    fn of(workspace: &Workspace) -> Self {
+    fn new(workspace: &Workspace) -> Self {
         let tools = workspace.tools();
         Self {
             grpcurl: tools.join("bin/grpcurl"),
@@ -70,7 +70,7 @@ impl Tools {
 
     /// All tools, or an error that lists the missing ones.
     pub fn find(workspace: &Workspace) -> Result<Self> {
-        let tools = Self::of(workspace);
+        let tools = Self::new(workspace);
         let mut missing: Vec<_> =
             tools.each().into_iter().filter(|t| !present(t.1, &t.2)).map(|t| format!("  {}: {}", t.0, t.2)).collect();
         if !tools.has_strace() {
@@ -98,7 +98,7 @@ impl Tools {
 
     /// Installs what is missing.
     pub fn install(workspace: &Workspace) -> Result<Self> {
-        let tools = Self::of(workspace);
+        let tools = Self::new(workspace);
         std::fs::create_dir_all(workspace.tools().join("bin")).context("creating target/tools/bin")?;
         let absent = [(&tools.grpcurl, GRPCURL), (&tools.buf, BUF)].into_iter().filter(|t| !present(t.0, t.1));
         let absent: Vec<_> = absent.collect();

@@ -57,7 +57,7 @@ impl Root {
     }
 
     /// A file of this machine at the same path, and the libraries it names.
-    fn put(&mut self, path: &Path) -> Result<()> {
+    fn copy_in(&mut self, path: &Path) -> Result<()> {
         if !self.put.insert(path.to_owned()) {
             return Ok(());
         }
@@ -70,7 +70,7 @@ impl Root {
     /// Only what it names.
     fn libraries(&mut self, path: &Path) -> Result<()> {
         let said = run::output(Command::new("ldd").arg(path)).unwrap_or_default();
-        said.lines().filter_map(library).try_for_each(|library| self.put(&library))
+        said.lines().filter_map(library).try_for_each(|library| self.copy_in(&library))
     }
 
     /// All files of a folder of this machine.
@@ -80,7 +80,7 @@ impl Root {
             if path.is_dir() {
                 self.put_folder(&path)?
             } else if path.exists() {
-                self.put(&path)?
+                self.copy_in(&path)?
             }
         }
         Ok(())
@@ -107,7 +107,7 @@ fn build(command: &mut Command) -> Result<()> {
 
 /// Names of the images.
 pub struct Images {
-    /// midshift.
+    /// The image of midshift.
     pub midshift: &'static str,
     /// The proxy.
     pub proxy: &'static str,
@@ -182,7 +182,7 @@ fn machine_bases(docker: &dyn Fn() -> Command, temporary: &Path, midshift: &Path
     let mut proxy = Root::new(&temporary.join("proxy-base"))?;
     proxy.libraries(midshift)?;
     let haproxy = run::output(Command::new("sh").args(["-c", "command -v haproxy"])).context("no haproxy")?;
-    proxy.put(Path::new(haproxy.trim()))?;
+    proxy.copy_in(Path::new(haproxy.trim()))?;
     proxy.build(docker, "midshift-proxy-base:machine", "")
 }
 
@@ -191,10 +191,10 @@ fn database(docker: &dyn Fn() -> Command, temporary: &Path, name: &str) -> Resul
     let version = programs.parent().context("programs have a folder")?;
     let mut root = Root::new(&temporary.join("database"))?;
     for program in ["postgres", "initdb", "pg_isready"] {
-        root.put(&programs.join(program))?;
+        root.copy_in(&programs.join(program))?;
     }
     for library in ["dict_snowball.so", "plpgsql.so"] {
-        root.put(&version.join("lib").join(library))?;
+        root.copy_in(&version.join("lib").join(library))?;
     }
     let number = version.file_name().context("a version")?;
     root.put_folder(&Path::new("/usr/share/postgresql").join(number))?;
@@ -204,10 +204,10 @@ fn database(docker: &dyn Fn() -> Command, temporary: &Path, name: &str) -> Resul
     }
     for zone in ["UTC", "GMT", "Etc/UTC"].map(|zone| Path::new("/usr/share/zoneinfo").join(zone)) {
         if zone.exists() {
-            root.put(&zone)?;
+            root.copy_in(&zone)?;
         }
     }
-    root.put(Path::new("/bin/sh"))?;
+    root.copy_in(Path::new("/bin/sh"))?;
     root.write("usr/local/bin/start", START)?;
     root.write("var/lib/postgresql/data/.keep", "")?;
     let path = format!("ENV PATH={}:/usr/local/bin:/bin\n", programs.display());

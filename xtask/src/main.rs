@@ -83,6 +83,9 @@ fn main() -> ExitCode {
             sweep::torture(&workspace, &sweep::NIGHTLY, from, Some(sweep::NIGHTLY_SEEDS))
         }
         Verb::Torture { sweeps, seeds, from, .. } => sweep::torture(&workspace, &sweeps, from, seeds),
+        Verb::Stack(stack::Verb::Test { binary, docker: true, .. }) => {
+            docker::test(&workspace, &stack::midshift(&workspace, binary)?)
+        }
         Verb::Stack(verb) => stack::run(&workspace, verb),
         Verb::Dist(options) => dist::dist(&workspace, &options),
         Verb::Golden => sweep::golden(&workspace),
@@ -92,7 +95,7 @@ fn main() -> ExitCode {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::FAILURE,
         Err(error) => {
-            run::say(&format!("error: {error:#}"));
+            run::print_line(&format!("error: {error:#}"));
             ExitCode::FAILURE
         }
     }

@@ -161,7 +161,7 @@ impl Count {
         });
         let list = slowest.list(SLOWEST_NAMED);
         let lines: Vec<_> = list.iter().map(|(took, name)| format!("{:>6.1} s  {name}", took.as_secs_f64())).collect();
-        run::say(&format!("the slowest tests:\n{}", lines.join("\n")));
+        run::print_line(&format!("the slowest tests:\n{}", lines.join("\n")));
         passed
     }
 

@@ -15,7 +15,7 @@ const POLL: Duration = Duration::from_millis(100);
 
 /// Tells the person at the terminal; data goes to [`print()`].
 #[expect(clippy::print_stderr, reason = "the one place where xtask talks")]
-pub fn say(line: &str) {
+pub fn print_line(line: &str) {
     eprintln!("{line}");
 }
 
@@ -27,13 +27,13 @@ pub fn print(line: &str) {
 
 /// Runs to the end; whether it succeeded.
 pub fn succeeds(command: &mut Command) -> Result<bool> {
-    say(&format!("$ {}", shown(command)));
+    print_line(&format!("$ {}", shown(command)));
     Ok(command.status().with_context(|| format!("running {}", shown(command)))?.success())
 }
 
 /// Runs to the end, passing stdout on line by line and showing each line to `read`; whether it succeeded.
 pub fn reading(command: &mut Command, mut read: impl FnMut(&str)) -> Result<bool> {
-    say(&format!("$ {}", shown(command)));
+    print_line(&format!("$ {}", shown(command)));
     let mut child = command.stdout(Stdio::piped()).spawn().with_context(|| format!("running {}", shown(command)))?;
     let stdout = child.stdout.take().context("stdout was piped")?;
     for line in BufReader::new(stdout).split(b'\n') {
@@ -60,13 +60,13 @@ pub fn output(command: &mut Command) -> Option<String> {
 #[expect(clippy::disallowed_methods, reason = "a pause between tries, outside of any runtime")]
 pub fn install(command: &mut Command) -> Result<()> {
     for attempt in 1..=INSTALL_TRIES {
-        say(&format!("$ {}", shown(command)));
+        print_line(&format!("$ {}", shown(command)));
         if within(command, INSTALL_LIMIT)? {
             return Ok(());
         }
         if attempt < INSTALL_TRIES {
             let pause = Duration::from_secs(u64::from(attempt) * 5);
-            say(&format!("try {attempt} of {INSTALL_TRIES} failed; again in {} s", pause.as_secs()));
+            print_line(&format!("try {attempt} of {INSTALL_TRIES} failed; again in {} s", pause.as_secs()));
             std::thread::sleep(pause);
         }
     }
@@ -83,7 +83,7 @@ fn within(command: &mut Command, limit: Duration) -> Result<bool> {
         }
         std::thread::sleep(POLL);
     }
-    say(&format!("no end after {} s", limit.as_secs()));
+    print_line(&format!("no end after {} s", limit.as_secs()));
     child.kill().context("ending a command that took too long")?;
     child.wait().context("waiting")?;
     Ok(false)

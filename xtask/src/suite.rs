@@ -23,7 +23,7 @@ pub fn test(workspace: &Workspace, install: bool, no_docker: bool, asked: &[Part
     let mut parts = in_order(asked);
     if no_docker {
         parts.retain(|part| *part != Part::Compose);
-        run::say("--no-docker: the part `compose` is left out");
+        run::print_line("--no-docker: the part `compose` is left out");
     }
     let mut lines = Vec::new();
     let mut count = Count::default();
@@ -37,10 +37,10 @@ pub fn test(workspace: &Workspace, install: bool, no_docker: bool, asked: &[Part
         lines.push(Line { name: "tools", took, passed: true });
     }
     for part in parts {
-        run::say(&format!("\n== {}", part.name()));
+        run::print_line(&format!("\n== {}", part.name()));
         let (outcome, took) = timed(|| part.run(workspace, tools.as_ref(), &mut count));
         let passed = outcome.unwrap_or_else(|error| {
-            run::say(&format!("error: {error:#}"));
+            run::print_line(&format!("error: {error:#}"));
             false
         });
         lines.push(Line { name: part.name(), took, passed });
@@ -51,7 +51,7 @@ pub fn test(workspace: &Workspace, install: bool, no_docker: bool, asked: &[Part
     let passed = lines.iter().all(|line| line.passed) && count.failed == 0;
     print_table(&lines, count);
     if let Some(failed) = lines.iter().find(|line| !line.passed) {
-        run::say(&format!("failed: {0}; next: cargo xtask test {0}", failed.name));
+        run::print_line(&format!("failed: {0}; next: cargo xtask test {0}", failed.name));
     }
     if count != Count::default() {
         run::print(&format!("{} passed, {} failed", count.passed, count.failed));

@@ -166,7 +166,7 @@ fn each_seed(workspace: &Workspace, sweep: &str, filter: &str, from: u64, seeds:
         workspace.export_programs(&mut command)?;
         command.env("MIDSHIFT_SEED", seed.to_string()).env("MIDSHIFT_STORY", "all").env("MIDSHIFT_NIGHT", "all");
         if !counted(&mut command)? {
-            run::say(&format!("next: cargo xtask torture {sweep} --from {seed} --seeds 1"));
+            run::print_line(&format!("next: cargo xtask torture {sweep} --from {seed} --seeds 1"));
             return Ok(false);
         }
     }
@@ -194,7 +194,7 @@ pub fn golden(workspace: &Workspace) -> Result<bool> {
     let mut command = workspace.cargo(&["test", "--workspace", "--tests", "--no-fail-fast", "--", "golden"]);
     workspace.export_programs(&mut command)?;
     let passed = counted(command.env("BLESS", "1"))?;
-    run::say("next: git diff, and read it before you commit it");
+    run::print_line("next: git diff, and read it before you commit it");
     Ok(passed)
 }
 

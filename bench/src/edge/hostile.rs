@@ -2,7 +2,7 @@
 //!
 //! Invariant: a child; what it counts is what peers see: how many of them were turned away, how many requests were answered and refused.
 
-use super::Load;
+use super::load::Load;
 use anyhow::Context;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;

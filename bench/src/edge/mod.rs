@@ -4,12 +4,14 @@
 //! the other cores, and come from another address. Plain text, so that a peer can break HTTP/2 itself. Called by `main`.
 
 mod hostile;
+mod load;
 
 use crate::child::Child;
 use crate::figure::{Figure, percentile};
-use crate::ota::{Told, unless_stopped};
+use crate::outcome::{Told, unless_stopped};
 use anyhow::{Context, ensure};
 use hostile::{ANSWERED, REFUSED, THERE, TURNED_AWAY};
+use load::Load;
 use midshift::door;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -51,44 +53,6 @@ pub struct EdgeArgs {
     /// Not used: nothing is written.
     #[arg(long, hide = true)]
     dir: Option<PathBuf>,
-}
-
-/// What hostile peers do.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum Load {
-    /// A preface, one byte in half a second.
-    Slow,
-    /// Nothing, or half a preface, and then nothing.
-    HalfOpen,
-    /// As half-open, more of them than the server has descriptors.
-    Descriptors,
-    /// Oversized and malformed frames, again and again.
-    Frames,
-    /// Requests as fast as they are answered.
-    Flood,
-}
-
-impl Load {
-    const ALL: [Self; 5] = [Self::Slow, Self::HalfOpen, Self::Descriptors, Self::Frames, Self::Flood];
-
-    const fn words(self) -> &'static str {
-        match self {
-            Self::Slow => "slow peers",
-            Self::HalfOpen => "half-open peers",
-            Self::Descriptors => "out of descriptors",
-            Self::Frames => "broken frames",
-            Self::Flood => "flood of requests",
-        }
-    }
-    const fn flag(self) -> &'static str {
-        match self {
-            Self::Slow => "slow",
-            Self::HalfOpen => "half-open",
-            Self::Descriptors => "descriptors",
-            Self::Frames => "frames",
-            Self::Flood => "flood",
-        }
-    }
 }
 
 /// Children of this measurement.
@@ -176,7 +140,7 @@ impl Turns {
         };
         let ([p50, idle_p50], [p99, idle_p99]) = (of(|calls| calls.p50_ms), of(|calls| calls.p99_ms));
         let figure = |what: &str, unit: &'static str, values: &[f64], limit: &str, beside: &[f64]| {
-            Figure::of("edge", format!("{name}: {what}"), unit, values, Some((limit, beside)))
+            Figure::new("edge", format!("{name}: {what}"), unit, values, Some((limit, beside)))
         };
         vec![
             figure("a call of somebody else, p50", "ms", &p50, "idle, p50", &idle_p50),

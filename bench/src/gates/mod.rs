@@ -3,12 +3,11 @@
 //!
 //! Invariant: the verdicts are those of `midshift_core::gates`, which a server uses; only the robots and their luck are made up here.
 
+mod luck;
 mod robots;
 mod tasks;
 
 use crate::figure::Figure;
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
 
 /// What is simulated.
 #[derive(Clone, Debug, clap::Args)]
@@ -30,11 +29,4 @@ pub fn run(args: GatesArgs) -> anyhow::Result<Vec<Figure>> {
     figures.extend(robots::first_failure(args.seed, runs));
     figures.extend(tasks::figures(args.seed, runs)?);
     Ok(figures)
-}
-
-/// Chance for one kind of roll-out: what it draws does not depend on which others were simulated before.
-fn luck(seed: u64, kind: u64) -> ChaCha8Rng {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    rng.set_stream(kind);
-    rng
 }

@@ -1,6 +1,6 @@
 //! Verdicts on how many robots failed: the naive rule, the sequential test, and the policy for a failure among few.
 
-use super::luck;
+use super::luck::seeded;
 use crate::figure::{Estimate, Figure};
 use midshift_core::gates::{RobotOutcomes, Verdict, upper_bound_permille};
 use rand::RngExt;
@@ -90,7 +90,7 @@ fn roll_out(judge: Judge, rate: f64, fleet: u32, rng: &mut impl RngExt) -> (Verd
 }
 
 fn many(judge: Judge, rate: f64, fleet: u32, (seed, kind): (u64, u64), runs: usize) -> Vec<(Verdict, u32)> {
-    let mut rng = luck(seed, kind);
+    let mut rng = seeded(seed, kind);
     (0..runs).map(|_| roll_out(judge, rate, fleet, &mut rng)).collect()
 }
 
@@ -109,7 +109,7 @@ pub fn computed() -> Vec<Figure> {
         ("robots that promote with 1 failure", first(1, Verdict::Promote), DESIGN_SEQUENTIAL.2),
     ];
     let told =
-        |name: String, unit, ours: f64, design: f64| Figure::of("G2", name, unit, &[ours], Some((DESIGN, &[design])));
+        |name: String, unit, ours: f64, design: f64| Figure::new("G2", name, unit, &[ours], Some((DESIGN, &[design])));
     let anchors =
         anchors.map(|(name, ours, design)| told(format!("SPRT, {name}"), "robots", ours.into(), design.into()));
     let bounds = DESIGN_BOUNDS.map(|(clean, design)| {

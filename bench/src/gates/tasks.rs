@@ -1,6 +1,6 @@
 //! Verdicts on task failures: how often the evidence accuses a release that is no worse, and how soon one that is.
 
-use super::luck;
+use super::luck::seeded;
 use crate::figure::{Estimate, Figure};
 use midshift_core::gates::{FailureEvidence, Suspicion, TaskTally};
 use midshift_core::ids::RobotId;
@@ -69,7 +69,7 @@ impl Shift<'_> {
     }
 
     fn many(&self, seed: u64, kind: u64, runs: usize) -> Vec<End> {
-        let mut rng = luck(seed, kind);
+        let mut rng = seeded(seed, kind);
         (0..runs).map(|_| self.play(&mut rng)).collect()
     }
 }

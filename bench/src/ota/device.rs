@@ -75,7 +75,7 @@ fn decode(base: Option<&[u8]>, way: &[u8], new: &[u8]) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn put(sets: &mut DiskSets, bytes: &[u8]) -> anyhow::Result<Wanted> {
+fn store_content(sets: &mut DiskSets, bytes: &[u8]) -> anyhow::Result<Wanted> {
     let wanted = Wanted { digest: Digest::of(bytes), length: bytes.len() as u64 };
     for (chunk, at) in bytes.chunks(CHUNK_BYTES as usize).zip((0..).step_by(CHUNK_BYTES as usize)) {
         sets.write(&wanted, at, chunk)?;
@@ -91,8 +91,8 @@ fn applied(base: Option<&[u8]>, way: &[u8], new: &[u8], room: &Path) -> anyhow::
     for _ in 0..TIMES {
         let folder = tempfile::tempdir_in(room)?;
         let mut sets = DiskSets::open(folder.path())?;
-        let base = base.map(|base| put(&mut sets, base)).transpose()?;
-        let way = put(&mut sets, way)?;
+        let base = base.map(|base| store_content(&mut sets, base)).transpose()?;
+        let way = store_content(&mut sets, way)?;
         let wanted = Wanted { digest: Digest::of(new), length: new.len() as u64 };
         let begun = Instant::now();
         sets.decode(&wanted, base.map(|base| base.digest).as_ref(), &way)?;
@@ -126,11 +126,11 @@ fn ways(pair: &str, old: &[u8], new: &[u8], room: &Path) -> anyhow::Result<Vec<F
         let (copy, disk) =
             (Some(("copy of the new file", &*copy_s)), Some(("write, sync and SHA-256 of it", &*disk_s)));
         figures.extend([
-            Figure::of("P9", name(word), "KiB", &[kib(way.len())], beside_whole),
-            Figure::of("P9", name(&format!("{word}, share")), "%", &[kib(way.len()) * 100.0 / median(&whole)], None),
-            Figure::of("P9", name(&format!("{word}, made by who signs")), "s", &encode_s, sha),
-            Figure::of("P9", name(&format!("{word}, undone in memory")), "s", &decode_s, copy),
-            Figure::of("P9", name(&format!("{word}, applied by a robot")), "s", &apply_s, disk),
+            Figure::new("P9", name(word), "KiB", &[kib(way.len())], beside_whole),
+            Figure::new("P9", name(&format!("{word}, share")), "%", &[kib(way.len()) * 100.0 / median(&whole)], None),
+            Figure::new("P9", name(&format!("{word}, made by who signs")), "s", &encode_s, sha),
+            Figure::new("P9", name(&format!("{word}, undone in memory")), "s", &decode_s, copy),
+            Figure::new("P9", name(&format!("{word}, applied by a robot")), "s", &apply_s, disk),
         ]);
     }
     Ok(figures)

@@ -4,7 +4,7 @@
 //! Invariant: a robot whose session ends comes back and proves its succession; what it was told before is not counted twice. Called by
 //! children only.
 
-use crate::robot::{self, Ear, Voice};
+use crate::robot::{self, RobotReceiver, RobotSender};
 use anyhow::Context;
 use midshift_core::ids::{BundleId, WaypointId};
 use midshift_core::limits;
@@ -71,10 +71,10 @@ pub struct Heard {
 
 impl Heard {
     /// Nothing yet.
-    pub fn of(robots: usize) -> Self {
+    pub fn new(robots: usize) -> Self {
         Self { robots: (0..robots).map(|_| Mutex::default()).collect(), with_directive: AtomicUsize::new(0) }
     }
-    fn take(&self, index: usize, update: &DesiredUpdate) {
+    fn count_offer(&self, index: usize, update: &DesiredUpdate) {
         let mut told = self.robots[index].lock().unwrap_or_else(PoisonError::into_inner);
         if told.first.is_none() {
             told.first = Some(Instant::now());
@@ -137,10 +137,10 @@ impl Hearer {
             let permit = self.opening.acquire().await?;
             let opened = timeout(SILENT_AFTER, robot::open(&self.server, hello.clone())).await;
             drop(permit);
-            if let Ok(Ok((mut voice, mut ear, welcome))) = opened {
+            if let Ok(Ok((mut sender, mut receiver, welcome))) = opened {
                 // How it ended does not matter: it comes back.
-                let _ = self.attend(&mut voice, &mut ear).await;
-                let said = &voice.reported;
+                let _ = self.attend(&mut sender, &mut receiver).await;
+                let said = &sender.reported;
                 let next_seq = said.produced.get(&Lane::Event).map_or(1, |last| last + 1);
                 hello.lanes = [(Lane::Event, LanePosition { first_seq: next_seq, next_seq })].into();
                 hello.reported = ReportedState { hb: 0, session_epoch: 0, ..said.clone() };
@@ -152,33 +152,33 @@ impl Hearer {
         }
     }
     /// One session, to its end.
-    async fn attend(&self, voice: &mut Voice, ear: &mut Ear) -> anyhow::Result<()> {
-        voice.beat(false).await?;
+    async fn attend(&self, sender: &mut RobotSender, receiver: &mut RobotReceiver) -> anyhow::Result<()> {
+        sender.beat(false).await?;
         let period = Duration::from_millis(limits::HEARTBEAT.as_ms());
         // Robots do not beat at one moment.
         let mut beat = interval_at(Instant::now() + period.mul_f64((self.index % 1_000) as f64 / 1_000.0), period);
         loop {
             tokio::select! {
-                down = timeout(SILENT_AFTER, ear.hear()) => {
+                down = timeout(SILENT_AFTER, receiver.receive()) => {
                     let down = down??;
                     if let Some(work) = &down.work {
-                        voice.reported.applied_work = work.generation;
+                        sender.reported.applied_work = work.generation;
                     }
                     if let Some(update) = &down.update {
-                        self.obey(voice, update).await?;
+                        self.obey(sender, update).await?;
                     }
                 }
-                _ = beat.tick() => voice.beat(false).await?,
+                _ = beat.tick() => sender.beat(false).await?,
             }
         }
     }
-    async fn obey(&self, voice: &mut Voice, update: &DesiredUpdate) -> anyhow::Result<()> {
-        let is_news = update.generation > voice.reported.applied_update;
-        voice.reported.applied_update = update.generation;
+    async fn obey(&self, sender: &mut RobotSender, update: &DesiredUpdate) -> anyhow::Result<()> {
+        let is_news = update.generation > sender.reported.applied_update;
+        sender.reported.applied_update = update.generation;
         if update.goal != Goal::Stage || update.directive.is_empty() {
             return Ok(());
         }
-        self.heard.take(self.index, update);
+        self.heard.count_offer(self.index, update);
         let Some(bundle) = self.takes.clone().filter(|_| is_news) else { return Ok(()) };
         let report = UpdateReport {
             state: UpdateState::Directed,
@@ -191,7 +191,7 @@ impl Hearer {
             progress_permille: 0,
             reason: None,
         };
-        voice.reported.update = Some(report.clone());
-        voice.tell(vec![RobotEvent::Update(UpdateEvent::Changed(report))]).await
+        sender.reported.update = Some(report.clone());
+        sender.send_events(vec![RobotEvent::Update(UpdateEvent::Changed(report))]).await
     }
 }

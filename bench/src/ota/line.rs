@@ -159,7 +159,7 @@ fn text(path: &Path) -> anyhow::Result<&str> {
 }
 
 /// What a child measured since the last time.
-fn take((child, out): &mut (Child, PathBuf)) -> anyhow::Result<Taken> {
+fn read_moments((child, out): &mut (Child, PathBuf)) -> anyhow::Result<Taken> {
     ensure!(child.ask(TAKE)? > 0, "a child measured nothing, or could not write it to {}", out.display());
     Ok(serde_json::from_slice(&std::fs::read(out)?)?)
 }
@@ -229,12 +229,12 @@ impl<'a> Stage<'a> {
     /// Lets everything settle and forgets what was measured before.
     async fn settle(&mut self) -> anyhow::Result<()> {
         sleep(SETTLE).await;
-        take(&mut self.asker)?;
-        take(&mut self.bare).map(drop)
+        read_moments(&mut self.asker)?;
+        read_moments(&mut self.bare).map(drop)
     }
 
     fn taken(&mut self) -> anyhow::Result<Taken> {
-        Ok(Taken { bare_ms: take(&mut self.bare)?.bare_ms, ..take(&mut self.asker)? })
+        Ok(Taken { bare_ms: read_moments(&mut self.bare)?.bare_ms, ..read_moments(&mut self.asker)? })
     }
 
     /// The body jams; when the server has it, a person mends it.
@@ -274,18 +274,18 @@ impl<'a> Stage<'a> {
     async fn download(&mut self, args: &LineArgs, load: &Release) -> anyhow::Result<Leg> {
         let end = Instant::now() + args.leg() * SLOW_TIMES as u32 + WITHIN;
         self.start(load).await?;
-        while self.look(args).await? < 0.5 {
+        while self.measure_share(args).await? < 0.5 {
             ensure!(Instant::now() < end, "no download began");
         }
-        take(&mut self.asker)?;
-        take(&mut self.bare)?;
+        read_moments(&mut self.asker)?;
+        read_moments(&mut self.bare)?;
         let (begun, from_ms, bytes) = (Instant::now(), midshift_agent::clock::wall().0, self.line.bytes_down()?);
         sleep(args.leg() / 2).await;
         let jam = self.jam().await?;
         let (mut to_ms, mut mbit_s, mut filled) = (0, 0.0, Instant::now());
         while filled.elapsed() < QUIET {
             ensure!(Instant::now() < end, "the download did not end");
-            if self.look(args).await? >= 0.5 {
+            if self.measure_share(args).await? >= 0.5 {
                 (to_ms, mbit_s, filled) = (midshift_agent::clock::wall().0, self.rate(bytes, begun)?, Instant::now());
             }
         }
@@ -298,7 +298,7 @@ impl<'a> Stage<'a> {
     }
 
     /// Share of the line that is in use now.
-    async fn look(&self, args: &LineArgs) -> anyhow::Result<f64> {
+    async fn measure_share(&self, args: &LineArgs) -> anyhow::Result<f64> {
         let (begun, bytes) = (Instant::now(), self.line.bytes_down()?);
         sleep(LOOK_EVERY).await;
         Ok(self.rate(bytes, begun)? / f64::from(args.mbit))
@@ -309,10 +309,10 @@ impl<'a> Stage<'a> {
         self.settle().await?;
         self.bare.0.ask(PULL)?;
         sleep(SETTLE).await;
-        take(&mut self.bare)?;
+        read_moments(&mut self.bare)?;
         let (begun, bytes) = (Instant::now(), self.line.bytes_down()?);
         sleep(long).await;
-        let (mbit_s, bare_ms) = (self.rate(bytes, begun)?, take(&mut self.bare)?.bare_ms);
+        let (mbit_s, bare_ms) = (self.rate(bytes, begun)?, read_moments(&mut self.bare)?.bare_ms);
         self.bare.0.ask(LEAVE)?;
         Ok(Stream { mbit_s, bare_ms })
     }
@@ -368,7 +368,7 @@ fn figures(args: &LineArgs, quiet: &Kind, loaded: &Kind, streams: &[Stream]) -> 
     let rates: Vec<f64> = loaded.legs.iter().map(|leg| leg.mbit_s).collect();
     let raw: Vec<f64> = streams.iter().map(|stream| stream.mbit_s).collect();
     let name = format!("download over {} Mbit/s", args.mbit);
-    let mut figures = vec![Figure::of("P9", name, "Mbit/s", &rates, Some(("bare TCP stream, same line", &raw)))];
+    let mut figures = vec![Figure::new("P9", name, "Mbit/s", &rates, Some(("bare TCP stream, same line", &raw)))];
     for (kind, word) in [(quiet, "quiet"), (loaded, "download")] {
         figures.extend(kind.figures(word));
     }
@@ -377,7 +377,7 @@ fn figures(args: &LineArgs, quiet: &Kind, loaded: &Kind, streams: &[Stream]) -> 
         let alone: Vec<f64> = quiet.legs.iter().map(|leg| percentile(&leg.taken.bare_ms, share)).collect();
         let name = format!("bare stream: bare TCP echo, {word}");
         let limit = format!("bare TCP echo, quiet line, {word}");
-        figures.push(Figure::of("P9", name, "ms", &beside, Some((&limit, &alone))));
+        figures.push(Figure::new("P9", name, "ms", &beside, Some((&limit, &alone))));
     }
     figures
 }
@@ -409,7 +409,7 @@ impl Kind {
                     Against::Echo => (&*echo, &*bare),
                     Against::Period => PERIOD,
                 };
-                figures.push(Figure::of("P9", name(&format!("{what}, {p}")), "ms", &values, Some(limit)));
+                figures.push(Figure::new("P9", name(&format!("{what}, {p}")), "ms", &values, Some(limit)));
             }
         };
         let of_ages = |what: fn(&Ages) -> &Vec<f64>| self.ages.iter().map(what).collect::<Vec<_>>();
@@ -421,14 +421,14 @@ impl Kind {
         tell("EVENT to its ack", &of_legs(|leg| &leg.taken.acks_ms), Against::Echo);
         let jams = |what: fn(&Jam) -> f64| self.legs.iter().map(|leg| what(&leg.jam)).collect::<Vec<_>>();
         let event = name("a jam to its CRITICAL event, durable");
-        figures.push(Figure::of("P9", event, "ms", &jams(|jam| jam.event_ms), Some(PERIOD)));
+        figures.push(Figure::new("P9", event, "ms", &jams(|jam| jam.event_ms), Some(PERIOD)));
         let code = name("a jam to its error code in a heartbeat");
-        figures.push(Figure::of("P9", code, "ms", &jams(|jam| jam.code_ms), Some(PERIOD)));
+        figures.push(Figure::new("P9", code, "ms", &jams(|jam| jam.code_ms), Some(PERIOD)));
         let samples: Vec<f64> = self.ages.iter().map(|ages| ages.known_ms.len() as f64).collect();
         let seconds = |leg: &Leg| (leg.stretch.end() - leg.stretch.start()) as f64 / 1e3;
         let expected: Vec<f64> = self.legs.iter().map(|leg| seconds(leg) / 2.0).collect();
         let limit = Some(("one each 2 s", &*expected));
-        figures.push(Figure::of("P9", name("STATUS samples of a leg"), "samples", &samples, limit));
+        figures.push(Figure::new("P9", name("STATUS samples of a leg"), "samples", &samples, limit));
         figures
     }
 }

@@ -4,6 +4,7 @@
 //! Called by `main`. Rooms: `server` measures the server, with robots of `hearers` and `swarm` in processes of their own, and samples signed by
 //! `release`; `line` measures a shaped line and `device` the bytes, with releases of `noise`.
 
+mod args;
 mod device;
 mod heard;
 pub mod hearers;
@@ -17,61 +18,10 @@ mod resume;
 mod server;
 pub mod swarm;
 
-use crate::figure::Figure;
-use std::path::PathBuf;
-use tokio::signal::unix::{SignalKind, signal};
+pub use args::OtaArgs;
 
-/// What to measure.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum What {
-    /// Directives, robots assigned, a kill, the way back.
-    Server,
-    /// A robot's words beside its download on a shaped line. Needs root and iproute2.
-    Line,
-    /// Sizes of patches, and downloads that are cut off.
-    Device,
-    /// All of it.
-    All,
-}
-
-/// What to measure of it.
-#[derive(Clone, Debug, clap::Args)]
-pub struct OtaArgs {
-    /// Which part.
-    #[arg(long, value_enum, default_value_t = What::All)]
-    part: What,
-    /// Rounds of each figure of the server.
-    #[arg(long, default_value_t = 2)]
-    rounds: usize,
-    #[command(flatten)]
-    server: server::ServerArgs,
-    #[command(flatten)]
-    line: line::LineArgs,
-    #[command(flatten)]
-    device: device::DeviceArgs,
-    /// Where everything is made and taken away again. Without it the temporary directory; it should be a real disk.
-    #[arg(long)]
-    dir: Option<PathBuf>,
-}
-
-/// What was measured, and what could not be.
-#[derive(Debug, Default)]
-pub struct Told {
-    /// Of the parts that could.
-    pub figures: Vec<Figure>,
-    /// Each part that could not, and why.
-    pub failed: Vec<String>,
-}
-
-impl Told {
-    /// Adds a part that was measured, or why it was not.
-    pub fn add(&mut self, part: &str, measured: anyhow::Result<Vec<Figure>>) {
-        match measured {
-            Ok(figures) => self.figures.extend(figures),
-            Err(error) => self.failed.push(format!("{part}: {error:#}")),
-        }
-    }
-}
+use crate::outcome::{Told, unless_stopped};
+use args::What;
 
 /// Runs the parts that were asked for. One that fails takes no other with it; Ctrl-C and SIGTERM end all of them, and what they made goes.
 pub async fn run(args: OtaArgs, say: &dyn Fn(&str)) -> Told {
@@ -91,26 +41,5 @@ async fn parts(args: &OtaArgs, told: &mut Told, say: &dyn Fn(&str)) {
     }
     if matches!(args.part, What::Line | What::All) {
         told.add("line", line::run(&args.line, dir).await);
-    }
-}
-
-/// Runs `all` to its end, or to that of somebody's patience; why it ended early.
-pub async fn unless_stopped(all: impl Future<Output = ()>) -> Option<String> {
-    tokio::select! {
-        // First, so that it listens before anything is made.
-        biased;
-        why = stopped() => Some(why),
-        () = all => None,
-    }
-}
-
-/// Waits for somebody who wants an end.
-async fn stopped() -> String {
-    match signal(SignalKind::terminate()) {
-        Err(error) => format!("SIGTERM cannot be heard: {error}"),
-        Ok(mut terminated) => tokio::select! {
-            _ = tokio::signal::ctrl_c() => "the rest: interrupted".to_owned(),
-            _ = terminated.recv() => "the rest: terminated".to_owned(),
-        },
     }
 }

@@ -239,12 +239,12 @@ fn ms_since(begun: Instant) -> f64 {
 type Asked = Option<(u64, Instant)>;
 
 async fn ask(server: &str, taken: &Mutex<Taken>) -> anyhow::Result<()> {
-    let (mut voice, mut ear, _) = robot::attach(server, "asker", None).await?;
+    let (mut sender, mut receiver, _) = robot::attach(server, "asker", None).await?;
     let (mut events, mut beats) = (tokio::time::interval(ASK_EVERY), tokio::time::interval(BEAT_EVERY));
     let [mut event, mut beat]: [Asked; 2] = [None, None];
     loop {
         tokio::select! {
-            heard = ear.hear() => {
+            heard = receiver.receive() => {
                 let (heard, mut taken) = (heard?, taken.lock().unwrap_or_else(PoisonError::into_inner));
                 let durable = heard.acks.iter().filter(|ack| ack.lane == Lane::Event).map(|ack| ack.seq).max();
                 if let (Some(seq), Some((asked, begun))) = (durable, event) && seq >= asked {
@@ -258,13 +258,13 @@ async fn ask(server: &str, taken: &Mutex<Taken>) -> anyhow::Result<()> {
             }
             _ = events.tick() => if event.is_none() {
                 let begun = Instant::now();
-                voice.tell_mode().await?;
-                event = Some((voice.produced(Lane::Event), begun));
+                sender.send_mode().await?;
+                event = Some((sender.produced(Lane::Event), begun));
             },
             _ = beats.tick() => if beat.is_none() {
                 let begun = Instant::now();
-                voice.beat(false).await?;
-                beat = Some((voice.reported.hb, begun));
+                sender.beat(false).await?;
+                beat = Some((sender.reported.hb, begun));
             },
         }
     }

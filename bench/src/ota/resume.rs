@@ -129,7 +129,7 @@ pub async fn run(args: &ResumeArgs, seed: u64, room: &Path) -> anyhow::Result<Ve
     let size = format!("{} MiB download", args.resume_mib);
     let whole = [args.resume_mib as f64];
     let mut figures =
-        vec![Figure::of("P9", format!("{size}: bytes of it"), "MiB", &mib(&uncut), Some(("the file", &whole)))];
+        vec![Figure::new("P9", format!("{size}: bytes of it"), "MiB", &mib(&uncut), Some(("the file", &whole)))];
     let most = uncut.iter().copied().fold(f64::INFINITY, f64::min);
     for (word, bytes) in [("lost connections", &lost), ("killed processes", &killed)] {
         let name = format!("{size}, {} {word}", args.cuts);
@@ -137,9 +137,9 @@ pub async fn run(args: &ResumeArgs, seed: u64, room: &Path) -> anyhow::Result<Ve
         let each: Vec<f64> = bytes.iter().map(|bytes| (bytes - most) / 1024.0 / args.cuts as f64).collect();
         let limit = Some(("uncut", &*mib(&uncut)));
         figures.extend([
-            Figure::of("P9", format!("{name}: bytes of it"), "MiB", &mib(bytes), limit),
-            Figure::of("P9", format!("{name}: again, share"), "%", &again, None),
-            Figure::of("P9", format!("{name}: again for each"), "KiB", &each, None),
+            Figure::new("P9", format!("{name}: bytes of it"), "MiB", &mib(bytes), limit),
+            Figure::new("P9", format!("{name}: again, share"), "%", &again, None),
+            Figure::new("P9", format!("{name}: again for each"), "KiB", &each, None),
         ]);
     }
     Ok(figures)

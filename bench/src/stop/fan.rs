@@ -36,7 +36,7 @@ struct Sockets {
 }
 
 impl Sockets {
-    fn tell(&self) -> u64 {
+    fn write_all(&self) -> u64 {
         self.acked.store(0, Relaxed);
         let open = self.open.lock().unwrap_or_else(PoisonError::into_inner);
         let frame = [7; FRAME_BYTES];
@@ -50,7 +50,7 @@ pub async fn serve(address: SocketAddr, stop: CancellationToken) -> anyhow::Resu
     let sockets = Arc::new(Sockets::default());
     let asked = sockets.clone();
     answer_questions(listener.local_addr()?, stop.clone(), move |question| match question {
-        TELL => asked.tell(),
+        TELL => asked.write_all(),
         _ => asked.acked.load(Relaxed),
     })?;
     let accepting = async {

@@ -101,7 +101,7 @@ fn lock(seen: &Mutex<Seen>) -> MutexGuard<'_, Seen> {
 
 impl All {
     /// None of them attached yet.
-    pub fn of(args: AttendArgs) -> Self {
+    pub fn new(args: AttendArgs) -> Self {
         Self { robots: (args.from..args.to).map(|_| Mutex::default()).collect(), args }
     }
     fn count(&self, is_so: impl Fn(&Seen) -> bool) -> u64 {
@@ -135,7 +135,7 @@ pub async fn run(all: Arc<All>, stop: CancellationToken) -> anyhow::Result<()> {
     for (at, proof) in Proof::read(&all.args.proofs)?.into_iter().enumerate() {
         let (line, socket) = ((all.clone(), opening.clone()), (all.clone(), opening.clone()));
         tasks.spawn(async move { attend(&line.0, &proof, at, &line.1).await });
-        tasks.spawn(async move { hear(&socket.0, at, &socket.1).await });
+        tasks.spawn(async move { read_fan(&socket.0, at, &socket.1).await });
     }
     tokio::select! {
         ended = tasks.join_next() => ended.context("no robots")??,
@@ -161,7 +161,7 @@ async fn attend(all: &All, proof: &Proof, at: usize, opening: &Semaphore) -> any
         tokio::select! {
             message = down.message() => {
                 let message = message?.and_then(|m| m.message).context("the stop service ended the line")?;
-                robot.hear(message).await?;
+                robot.take_message(message).await?;
                 permit = permit.filter(|_| !lock(robot.seen).is_synced);
             }
             _ = beat.tick() => robot.check_in().await?,
@@ -181,7 +181,7 @@ struct Robot<'a> {
 }
 
 impl Robot<'_> {
-    async fn hear(&mut self, message: Down) -> anyhow::Result<()> {
+    async fn take_message(&mut self, message: Down) -> anyhow::Result<()> {
         let now_ns = fan::now_ns();
         match message {
             Down::Told(told) => {
@@ -245,7 +245,7 @@ impl Robot<'_> {
 }
 
 /// One socket of the bare fan-out, to its end.
-async fn hear(all: &All, at: usize, opening: &Semaphore) -> anyhow::Result<()> {
+async fn read_fan(all: &All, at: usize, opening: &Semaphore) -> anyhow::Result<()> {
     let permit = opening.acquire().await?;
     let mut stream = TcpStream::connect(all.args.fan).await?;
     stream.set_nodelay(true)?;

@@ -2,12 +2,13 @@
 //!
 //! Invariant: the load is there in the turns of both; whatever was mounted or stopped is unmounted or goes on however the measurement ends.
 
+use super::beside::Beside;
 use super::site::Site;
-use super::{StopArgs, Turns, text, turns};
+use super::turns::{StopArgs, Turns, text, turns};
 use crate::child::Child;
 use crate::engine::{Engine, children_of};
 use crate::fsync::place;
-use crate::hall;
+use crate::grid_map;
 use crate::ota::noise::Releases;
 use anyhow::{Context, ensure};
 use rustix::process::{Pid, Signal, kill_process};
@@ -31,42 +32,6 @@ const DISK: &str = "size=256m";
 const WITHIN: Duration = Duration::from_secs(30);
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// What goes on beside.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum Beside {
-    /// Nothing: no server at all.
-    Nothing,
-    /// A server at the knee of its ingest.
-    Ingest,
-    /// A server whose robots download as fast as the machine carries it.
-    Bulk,
-    /// A server whose PostgreSQL was stopped with SIGSTOP.
-    Database,
-    /// A server on a disk without room, with the files of the stop service on it too.
-    Disk,
-    /// A server that is killed with SIGKILL right before each turn.
-    Kill,
-}
-
-impl Beside {
-    /// Those that were asked for, or all.
-    pub fn all(asked: &[Self]) -> Vec<Self> {
-        let all = [Self::Nothing, Self::Ingest, Self::Bulk, Self::Database, Self::Disk, Self::Kill];
-        all.into_iter().filter(|beside| asked.is_empty() || asked.contains(beside)).collect()
-    }
-    /// For names of figures.
-    pub fn words(self) -> &'static str {
-        match self {
-            Self::Nothing => "nothing beside",
-            Self::Ingest => "ingest at the knee",
-            Self::Bulk => "downloads at full rate",
-            Self::Database => "PostgreSQL stopped",
-            Self::Disk => "disk full",
-            Self::Kill => "server killed",
-        }
-    }
-}
-
 /// One size in one situation.
 pub async fn measure(
     args: &StopArgs,
@@ -89,7 +54,7 @@ pub async fn measure(
 
 /// A server below `room` on the first core, where the stop service is too.
 async fn server(room: &Path) -> anyhow::Result<Child> {
-    let map = hall::map(room, (HEARERS as f64).sqrt() as usize + 2)?;
+    let map = grid_map::write(room, (HEARERS as f64).sqrt() as usize + 2)?;
     Child::serve(&room.join("data"), Some(&map), None, Some(0)).await
 }
 
@@ -171,7 +136,7 @@ impl Drop for Stopped {
 async fn database(args: &StopArgs, site: &Site, robots: usize, room: &Path) -> anyhow::Result<Turns> {
     let engine = Engine::postgres(args.dir.as_deref())?;
     let bed = engine.bed(args.dir.as_ref())?;
-    let map = hall::map(room, (HEARERS as f64).sqrt() as usize + 2)?;
+    let map = grid_map::write(room, (HEARERS as f64).sqrt() as usize + 2)?;
     let mut server = bed.serve(Some(&map), Some(0)).await?;
     let _hearers = hearers(&server).await?;
     until(&mut server, crate::child::SESSIONS, HEARERS as u64).await?;

@@ -1,4 +1,6 @@
 use super::*;
+use crate::audit::note::NOTHING;
+use crate::audit::verify::{Broken, Chain, Ends, Export, Held, Mark, Verified};
 use crate::reason::{Kind as RefusalKind, Reason};
 use crate::time::Utc;
 use proptest::prelude::*;

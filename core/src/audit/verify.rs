@@ -2,7 +2,8 @@
 //!
 //! Invariant: the first thing that is wrong is what is said; nothing behind it is believed. One row at a time is held in memory.
 
-use super::{AuditRow, CUT, Head, id_of, index_of, link, open};
+use super::chain::{AuditRow, id_of, index_of, link, open};
+use super::note::{CUT, Head};
 use crate::limits;
 use crate::rows::{Revision, Row, Table};
 use crate::time::Utc;
@@ -301,7 +302,7 @@ impl Chain {
 /// First line of an export: of what, and where its chains end.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Export {
-    /// `midshift-audit-1`.
+    /// How the lines are laid out: `midshift-audit-1`.
     pub format: String,
     /// The site.
     pub site: String,

@@ -2,7 +2,17 @@
 //!
 //! Invariant: rounded up, so that a bound is never told better than it is.
 
-use super::{BOUND_ERROR_PERMILLE, GOOD_PERMILLE, RobotOutcomes};
+use super::rates::{BOUND_ERROR_PERMILLE, GOOD_PERMILLE};
+use serde::{Deserialize, Serialize};
+
+/// Robots that were attempted and decided. Skipped ones count nowhere.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct RobotOutcomes {
+    /// Came through.
+    pub clean: u32,
+    /// Went back by themselves, were lost, could not go back, or were taken out by the breaker.
+    pub failed: u32,
+}
 
 /// A share that lies on its limit to within this counts as on it: rounding must not move a bound by a step.
 const EQUAL: f64 = 1e-9;

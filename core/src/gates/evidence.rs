@@ -16,7 +16,7 @@
 //! that ends with a failure would blame whoever happened to work then ([`FailureEvidence::observe`]).
 
 use super::fixed::{Rounding, ln_micronats};
-use super::{ABORT_EVIDENCE, FAILURE_RATIO};
+use super::rates::{ABORT_EVIDENCE, FAILURE_RATIO};
 use crate::ids::RobotId;
 use crate::limits::COUNTED_MAX;
 use serde::{Deserialize, Serialize};

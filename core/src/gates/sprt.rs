@@ -6,9 +6,9 @@
 //! Hypotheses, Annals of Mathematical Statistics 16 (1945). Looked at after each robot or after each wave, it aborts at most α / (1 - β) of
 //! the good releases and promotes at most β / (1 - α) of the bad ones.
 
+use super::bound::{RobotOutcomes, false_abort_permille, upper_bound_permille};
 use super::fixed::{Rounding, ln_micronats};
-use super::{BAD_PERMILLE, FALSE_ABORT_PERMILLE, FALSE_PROMOTE_PERMILLE, FEW_ROBOTS, GOOD_PERMILLE};
-use super::{false_abort_permille, upper_bound_permille};
+use super::rates::{BAD_PERMILLE, FALSE_ABORT_PERMILLE, FALSE_PROMOTE_PERMILLE, FEW_ROBOTS, GOOD_PERMILLE};
 use serde::{Deserialize, Serialize};
 
 /// What a failed robot adds, micro-nats.
@@ -34,15 +34,6 @@ pub enum Verdict {
     Abort,
     /// Too little was seen for either.
     Inconclusive,
-}
-
-/// Robots that were attempted and decided. Skipped ones count nowhere.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
-pub struct RobotOutcomes {
-    /// Came through.
-    pub clean: u32,
-    /// Went back by themselves, were lost, could not go back, or were taken out by the breaker.
-    pub failed: u32,
 }
 
 /// A verdict on robots with all numbers behind it.

@@ -1,6 +1,6 @@
 //! The only way into a [`Site`]: names and numbers as read, checked all together. Called by the text format and the imports.
 
-use super::{
+use super::map::{
     Area, AreaDefaults, AreaIx, Inside, Kind, Lane, LaneIx, Place, PlaceIx, PlaceKind, Site, Source, Waypoint,
     WaypointIx,
 };
@@ -124,6 +124,26 @@ impl Draft {
         found.finish()?;
         index_lanes(&mut site);
         Ok(site)
+    }
+}
+
+impl Site {
+    /// The same site whose robots start here instead, and nowhere else.
+    ///
+    /// # Errors
+    /// The rules for `robot` in a site file.
+    pub fn with_starts(mut self, robots: &[(RobotId, WaypointId)]) -> Result<Self, Refusal> {
+        self.starts.clear();
+        self.starting.clear();
+        let draft = |(id, at): &(RobotId, WaypointId)| DraftRobot {
+            field: "robot".to_owned(),
+            id: id.to_string(),
+            at: at.to_string(),
+        };
+        let mut violations = Violations::default();
+        add_starts(&mut violations, &mut self, robots.iter().map(draft).collect());
+        violations.finish()?;
+        Ok(self)
     }
 }
 

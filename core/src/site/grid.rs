@@ -5,7 +5,7 @@
 //! Called by the binary for `--map` and `--tasks`, and by the bench.
 
 use super::draft::{Draft, DraftArea, DraftLane, DraftWaypoint};
-use super::{AreaDefaults, Kind, Site, Source, WaypointIx};
+use super::map::{AreaDefaults, Kind, Site, Source, WaypointIx};
 use crate::ids::WaypointId;
 use crate::limits::{SITE_FILE_BYTES, SITE_WAYPOINTS_MAX, TASK_LIST_MAX};
 use crate::reason::{Refusal, Violations};

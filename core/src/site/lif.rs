@@ -5,7 +5,7 @@
 
 use super::draft::{Draft, DraftArea, DraftLane, DraftWaypoint};
 use super::grid::site_id_of;
-use super::{AreaDefaults, Kind, Site, Source};
+use super::map::{AreaDefaults, Kind, Site, Source};
 use crate::limits::SITE_FILE_BYTES;
 use crate::reason::{Refusal, Violations};
 use serde::Deserialize;

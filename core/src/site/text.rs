@@ -5,7 +5,7 @@
 //! What may stand in a file is told in docs/sites.md, whose example is read here.
 
 use super::draft::{Draft, DraftArea, DraftLane, DraftPassage, DraftRobot, DraftWaypoint};
-use super::{Area, AreaDefaults, Kind, Lane, Place, PlaceKind, Site, Source, Waypoint};
+use super::map::{Area, AreaDefaults, Kind, Lane, Place, PlaceKind, Site, Source, Waypoint};
 use crate::limits::SITE_FILE_BYTES;
 use crate::reason::{Refusal, Violations};
 use serde::Deserialize;

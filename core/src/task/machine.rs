@@ -86,19 +86,19 @@ impl Phase {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Then {
-    /// CANCELED.
+    /// It ends as CANCELED.
     Canceled,
     /// FAILED, or NEEDS_OPERATOR if it is opened: a person must look where the item is.
     Failed,
     /// RETRY_WAIT, or NEEDS_OPERATOR if it is opened or its attempts are spent.
     Retry,
-    /// SUSPENDED.
+    /// It is held as SUSPENDED.
     Suspended,
     /// QUEUED: nobody took it.
     Requeue,
-    /// EXPIRED.
+    /// It ends as EXPIRED.
     Expired,
-    /// NEEDS_OPERATOR.
+    /// It waits for a person as NEEDS_OPERATOR.
     NeedsOperator,
 }
 

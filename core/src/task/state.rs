@@ -291,11 +291,11 @@ pub struct Attempt {
     pub reported: Option<u32>,
     /// Its first irreversible step is done or unknown.
     pub opened: bool,
-    /// UTC.
+    /// When it was offered, UTC.
     pub offered: Utc,
-    /// UTC.
+    /// When the robot took it, UTC; none: it has not.
     pub accepted: Option<Utc>,
-    /// UTC.
+    /// When it ended, UTC; none: it goes on.
     pub ended: Option<Utc>,
     /// What the robot reported.
     pub fault: Option<Fault>,

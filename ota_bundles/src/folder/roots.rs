@@ -4,29 +4,14 @@
 //! along the signatures that it had.
 
 use super::{Error, Folder, Signed, io, must_be_next};
-use crate::keys::{KeyId, SecretKey};
+use crate::keys::SecretKey;
 use crate::repository::{PEOPLE_LIFE_MS, RootDraft, add_signatures, check_root, sign_root};
-use crate::roots::{Asked, Change, merge_root};
+use crate::roots::{Asked, Change, WaitingRoot, merge_root};
 use midshift_core::reason::Refusal;
 use midshift_core::time::Utc;
 
 /// A root that is not signed by enough people yet.
 const PENDING: &str = "pending.root.json";
-
-/// A root on its way.
-#[derive(Clone, Debug)]
-pub struct WaitingRoot {
-    /// As it stands in `metadata/pending.root.json`.
-    pub document: Vec<u8>,
-    /// What it says.
-    pub draft: RootDraft,
-    /// Keys that have signed it.
-    pub signed_by: Vec<KeyId>,
-    /// Signatures that it lacks of the keys of the root before.
-    pub lacks_of_before: u64,
-    /// Signatures that it lacks of its own keys.
-    pub lacks_of_own: u64,
-}
 
 impl Folder {
     /// Drafts the next root, or changes the one that waits; none: only the year is new. How many signatures went with that.

@@ -4,7 +4,6 @@
 //! worth it.
 
 use super::{Error, Folder, io};
-use crate::digest::Digest;
 use crate::encoding::{Base, ENCODED_BYTES_MAX, ENCODED_BYTES_MIN, Encoded, encode};
 use crate::manifest::{Component, Manifest};
 use crate::repository::{FileTarget, listed};
@@ -116,10 +115,4 @@ impl Folder {
 fn bases<'a>(component: &'a Component, releases: &'a [Manifest]) -> impl Iterator<Item = &'a Component> {
     let others = releases.iter().flat_map(|release| &release.components);
     others.filter(move |other| other.name == component.name && other.digest != component.digest)
-}
-
-/// Names of listed ways that lead to nothing once `gone` is listed no more.
-pub(super) fn that_lead_to<'a>(gone: &BTreeSet<Digest>, known: &'a [FileTarget]) -> impl Iterator<Item = &'a str> {
-    let names = known.iter().map(|file| file.name.as_str());
-    names.filter(move |name| Way::of_target(name).is_some_and(|way| gone.contains(&way.to)))
 }

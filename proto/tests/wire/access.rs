@@ -18,7 +18,7 @@ fn paths() -> Vec<(String, Access)> {
     let pool = DescriptorPool::decode(midshift_proto::FILE_DESCRIPTOR_SET).expect("descriptors");
     let methods = pool.services().flat_map(|service| service.methods().collect::<Vec<_>>());
     let paths = methods.map(|m| format!("/{}/{}", m.parent_service().full_name(), m.name()));
-    paths.map(|path| (path.clone(), access::of(&path).expect(&path))).collect()
+    paths.map(|path| (path.clone(), access::find(&path).expect(&path))).collect()
 }
 
 fn holder(role: Role, scope: Scope) -> Caller {

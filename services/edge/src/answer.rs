@@ -13,7 +13,7 @@ use tonic::body::Body;
 /// What a request speaks.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Speech {
-    /// gRPC.
+    /// A call of gRPC.
     Grpc,
     /// gRPC-Web, with its own content type.
     GrpcWeb(HeaderValue),
@@ -22,7 +22,7 @@ pub(crate) enum Speech {
 }
 
 impl Speech {
-    pub fn of(headers: &HeaderMap) -> Self {
+    pub fn from_headers(headers: &HeaderMap) -> Self {
         let kind = headers.get(CONTENT_TYPE);
         match kind.map(HeaderValue::as_bytes) {
             Some(bytes) if bytes.starts_with(b"application/grpc-web") => {
@@ -78,7 +78,7 @@ mod tests {
 
     fn refused(content_type: Option<&'static str>) -> Response<Body> {
         let headers = content_type.map(|kind| (CONTENT_TYPE, HeaderValue::from_static(kind)));
-        let speech = Speech::of(&headers.into_iter().collect());
+        let speech = Speech::from_headers(&headers.into_iter().collect());
         speech.refuse(&Refusal::new(Kind::Exhausted, Code::TooManyRequests))
     }
 

@@ -23,7 +23,7 @@ pub(crate) enum Asker {
 }
 
 impl Asker {
-    pub fn of(caller: Result<&Caller, &Refusal>, address: IpAddr) -> Self {
+    pub fn from_caller(caller: Result<&Caller, &Refusal>, address: IpAddr) -> Self {
         match caller.map(Caller::who) {
             Ok(Who::Robot(robot_id)) => Self::Robot(robot_id.clone()),
             Ok(Who::Holder { token, .. }) => Self::Token(token.clone()),

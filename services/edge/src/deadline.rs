@@ -60,7 +60,7 @@ pub(crate) struct Over {
 }
 
 impl Over {
-    pub fn of(peer: &Peer) -> Self {
+    pub fn new(peer: &Peer) -> Self {
         Self { token: peer.over.clone(), heard: None }
     }
     /// Whether it is; wakes the task when it will be.

@@ -58,11 +58,11 @@ impl Denials {
     /// Whether one more of this asker may leave a trace. It counts as one that did.
     fn is_fit(&self, asker: &Asker) -> bool {
         let now = Instant::now();
-        self.each.take(asker, now, Class::Stop) && self.all.take(&(), now, Class::Stop)
+        self.each.admit(asker, now, Class::Stop) && self.all.admit(&(), now, Class::Stop)
     }
 
     /// Hands it over, if one more of this asker may leave a trace.
-    pub(crate) fn tell(&self, asker: &Asker, actor: Actor, network: IpAddr, path: &str, reason: &Reason) {
+    pub(crate) fn report(&self, asker: &Asker, actor: Actor, network: IpAddr, path: &str, reason: &Reason) {
         let Some(place) = self.is_fit(asker).then(|| self.sink.try_reserve().ok()).flatten() else {
             self.left_out.fetch_add(1, Relaxed);
             metrics::counter!("midshift_edge_denials_left_out_total", "port" => self.port).increment(1);

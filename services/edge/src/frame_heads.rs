@@ -134,7 +134,7 @@ impl Budget {
     }
 
     /// Whether there was one left.
-    fn take(&mut self) -> bool {
+    fn spend(&mut self) -> bool {
         let is_left = self.left > 0;
         self.left = self.left.saturating_sub(1);
         is_left
@@ -171,7 +171,7 @@ impl<Io> Counted<Io> {
         let (budget, mut is_flood) = (&mut self.budget, false);
         budget.refill(Instant::now());
         self.up.read(bytes, |frame| match frame {
-            Frame::Control => is_flood |= !budget.take(),
+            Frame::Control => is_flood |= !budget.spend(),
             Frame::Headers => budget.earn(),
             Frame::Data | Frame::Continuation => {}
         });

@@ -123,7 +123,7 @@ impl Edge {
                 accepted = accept.next() => accepted,
             };
             let Some((io, address)) = accepted else { break };
-            match places.take(network(address.ip())) {
+            match places.claim(network(address.ip())) {
                 Ok((seat, stranger)) => {
                     last += 1;
                     let who = (ConnectionId(last), stranger);
@@ -175,12 +175,12 @@ impl Places {
     }
 
     /// One of each, or what is full, as metrics name it.
-    fn take(&self, network: IpAddr) -> Result<(Seat<IpAddr>, Stranger), &'static str> {
-        let seat = self.all.take(network, Class::Stop).map_err(|full| match full {
+    fn claim(&self, network: IpAddr) -> Result<(Seat<IpAddr>, Stranger), &'static str> {
+        let seat = self.all.claim(network, Class::Stop).map_err(|full| match full {
             Full::Total => "connections_max",
             Full::Kind => "connections_per_network_max",
         })?;
-        let stranger = self.strangers.as_ref().map(|strangers| strangers.take(network, Class::Stop)).transpose();
+        let stranger = self.strangers.as_ref().map(|strangers| strangers.claim(network, Class::Stop)).transpose();
         let stranger = stranger.map_err(|full| match full {
             Full::Total => "strangers_max",
             Full::Kind => "strangers_per_network_max",

@@ -30,7 +30,7 @@ impl From<Rate> for Bucket {
 impl Bucket {
     /// Takes one token of a bucket that is full again at `full_at`; none: there is none for this class, and the bucket stays as it is. What is kept for
     /// higher classes is no less for long: tokens come back as fast for all.
-    fn take(self, full_at: Instant, now: Instant, class: Class) -> Option<Instant> {
+    fn fill(self, full_at: Instant, now: Instant, class: Class) -> Option<Instant> {
         let full_at = full_at.max(now) + self.token;
         let share = u32::try_from(class.share(self.burst as usize)).unwrap_or(self.burst);
         (full_at - now <= self.token * share).then_some(full_at)
@@ -51,14 +51,14 @@ impl<K: Eq + Hash + Clone> Rates<K> {
     }
 
     /// Whether `key` may ask for something of this class now; if so, one token of it is gone.
-    pub fn take(&self, key: &K, now: Instant, class: Class) -> bool {
+    pub fn admit(&self, key: &K, now: Instant, class: Class) -> bool {
         let mut buckets = self.full_at.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(full_at) = buckets.get_mut(key) {
-            let taken = self.bucket.take(*full_at, now, class);
+            let taken = self.bucket.fill(*full_at, now, class);
             *full_at = taken.unwrap_or(*full_at);
             return taken.is_some();
         }
-        if let Some(full_at) = self.bucket.take(now, now, class) {
+        if let Some(full_at) = self.bucket.fill(now, now, class) {
             buckets.put(key.clone(), full_at);
         }
         true
@@ -79,7 +79,7 @@ mod tests {
 
     /// How many of `tries` are let in.
     fn let_in(rates: &Rates<&'static str>, key: &'static str, now: Instant, tries: usize) -> usize {
-        (0..tries).filter(|_| rates.take(&key, now, Class::Stop)).count()
+        (0..tries).filter(|_| rates.admit(&key, now, Class::Stop)).count()
     }
 
     #[test]
@@ -93,7 +93,7 @@ mod tests {
     #[test]
     fn who_floods_with_what_can_wait_can_still_decide_and_stop_and_gets_no_less_for_long() {
         let (rates, mut now) = (Rates::new(rate(10, 10), 8), Instant::now());
-        let let_in = |class, tries, now| (0..tries).filter(|_| rates.take(&"a", now, class)).count();
+        let let_in = |class, tries, now| (0..tries).filter(|_| rates.admit(&"a", now, class)).count();
         assert_eq!(Class::ALL.map(|class| let_in(class, 100, now)), [6, 1, 1, 1, 1]);
         let mut bulk = 0;
         for _ in 0..100 {

@@ -64,20 +64,20 @@ impl Rules {
     /// Its seat and its caller's own deadline, or why it goes no further.
     fn admit(&self, asker: &Asker, path: &str, headers: &HeaderMap, speech: &Speech) -> Result<Admitted, Refusal> {
         let (class, now) = (access::class(path).with(self.bugs), Instant::now());
-        if !self.rates.take(asker, now, class) {
+        if !self.rates.admit(asker, now, class) {
             return Err(Refusal::new(Kind::Exhausted, Code::TooManyRequests));
         }
         let stranger = match asker {
-            Asker::Stranger(_) => self.strangers.take(asker.clone(), class).map(Some),
+            Asker::Stranger(_) => self.strangers.claim(asker.clone(), class).map(Some),
             _ => Ok(None),
         };
-        let seat = stranger.and_then(|stranger| Ok((self.seats.take(asker.clone(), class)?, stranger)));
+        let seat = stranger.and_then(|stranger| Ok((self.seats.claim(asker.clone(), class)?, stranger)));
         let seats = seat.map_err(|full| refused(full, "requests are under way"))?;
         // None goes before another: each may have the last seat.
-        let watch = access::is_watch(path).then(|| self.watches.take(asker.clone(), Class::Stop)).transpose();
+        let watch = access::is_watch(path).then(|| self.watches.claim(asker.clone(), Class::Stop)).transpose();
         let watch = watch.map_err(|full| refused(full, "watches go on"))?;
         if self.bugs.seats_are_kept() {
-            std::mem::forget(self.seats.take(asker.clone(), Class::Stop));
+            std::mem::forget(self.seats.claim(asker.clone(), Class::Stop));
         }
         let seat = Inside::new(&self.gauge, seats, watch);
         let given = if *speech == Speech::Http { None } else { deadline::given(headers)? };
@@ -159,7 +159,7 @@ impl Door {
     fn admit(&self, request: &Request<Incoming>, speech: &Speech) -> Result<(Caller, Admitted), Refusal> {
         let (path, headers) = (request.uri().path(), request.headers());
         let caller = self.principals.caller(&self.peer, headers);
-        let asker = Asker::of(caller.as_ref(), self.peer.address.ip());
+        let asker = Asker::from_caller(caller.as_ref(), self.peer.address.ip());
         if !matches!(asker, Asker::Stranger(_)) {
             self.stranger.is_known();
         }
@@ -187,19 +187,19 @@ impl Door {
             return;
         }
         let (actor, from) = (Actor::from(caller.unwrap_or(&Caller::nobody())), network(self.peer.address.ip()));
-        tell(self.rules.port, self.denials.as_deref(), asker, actor, from, path, refusal);
+        report_denial(self.rules.port, self.denials.as_deref(), asker, actor, from, path, refusal);
     }
 
     /// For a service that denies what only it can judge.
     fn denying(&self, caller: &Caller, uri: &Uri) -> Denying {
         let Some(denials) = self.denials.clone() else { return Denying::default() };
-        let asker = Asker::of(Ok(caller), self.peer.address.ip());
+        let asker = Asker::from_caller(Ok(caller), self.peer.address.ip());
         let (port, from, caller) = (self.rules.port, network(self.peer.address.ip()), caller.clone());
         Denying::new(Arc::new(Inward { port, denials, asker, caller, from, uri: uri.clone() }))
     }
 }
 
-fn tell(
+fn report_denial(
     port: &'static str,
     denials: Option<&Denials>,
     asker: &Asker,
@@ -211,7 +211,7 @@ fn tell(
     let (code, path) = (refusal.reason.code, denials::cut(path));
     tracing::info!(port, peer = %asker, %actor, path, %code, "a request was denied");
     if let Some(denials) = denials {
-        denials.tell(asker, actor, from, path, &refusal.reason);
+        denials.report(asker, actor, from, path, &refusal.reason);
     }
 }
 
@@ -231,7 +231,7 @@ impl Told for Inward {
         metrics::counter!("midshift_edge_requests_denied_inside_total", "port" => port, "reason" => reason)
             .increment(1);
         let actor = Actor::from(&self.caller);
-        tell(port, Some(&*self.denials), &self.asker, actor, self.from, self.uri.path(), refusal);
+        report_denial(port, Some(&*self.denials), &self.asker, actor, self.from, self.uri.path(), refusal);
     }
 }
 
@@ -242,8 +242,8 @@ impl HyperService<Request<Incoming>> for Door {
 
     fn call(&self, mut request: Request<Incoming>) -> Self::Future {
         let (stream, now) = (self.activity.begin(), Instant::now());
-        let over = Over::of(&self.peer);
-        let speech = Speech::of(request.headers());
+        let over = Over::new(&self.peer);
+        let speech = Speech::from_headers(request.headers());
         let (caller, Admitted { seat, deadline }) = match self.admit(&request, &speech) {
             Ok(admitted) => admitted,
             Err(refusal) => {

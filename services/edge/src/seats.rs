@@ -63,7 +63,7 @@ impl<K: Eq + Hash + Clone> Seats<K> {
     }
 
     /// A seat for something of this class, or which limit is reached: the last seats, of all and of each kind, are for higher classes.
-    pub fn take(self: &Arc<Self>, kind: K, class: Class) -> Result<Seat<K>, Full> {
+    pub fn claim(self: &Arc<Self>, kind: K, class: Class) -> Result<Seat<K>, Full> {
         let mut taken = self.taken();
         let free = class.share(self.total_max).saturating_sub(taken.total);
         if free == 0 {
@@ -118,13 +118,13 @@ mod tests {
     #[test]
     fn one_kind_fills_its_own_seats_and_leaves_the_others() {
         let seats = Seats::new(3, 2);
-        let first = seats.take("a", Class::Stop).expect("room");
-        let _second = seats.take("a", Class::Stop).expect("room");
-        assert_eq!(seats.take("a", Class::Stop).err(), Some(Full::Kind));
-        let _other = seats.take("b", Class::Stop).expect("room for another kind");
-        assert_eq!(seats.take("c", Class::Stop).err(), Some(Full::Total));
+        let first = seats.claim("a", Class::Stop).expect("room");
+        let _second = seats.claim("a", Class::Stop).expect("room");
+        assert_eq!(seats.claim("a", Class::Stop).err(), Some(Full::Kind));
+        let _other = seats.claim("b", Class::Stop).expect("room for another kind");
+        assert_eq!(seats.claim("c", Class::Stop).err(), Some(Full::Total));
         drop(first);
-        let _again = seats.take("a", Class::Stop).expect("a seat that was given back");
+        let _again = seats.claim("a", Class::Stop).expect("a seat that was given back");
     }
 
     #[test]
@@ -133,7 +133,7 @@ mod tests {
         let mut inside = Vec::new();
         let mut fill = |kind: u32| {
             let before = inside.len();
-            while let Ok(seat) = seats.take(kind, Class::Stop) {
+            while let Ok(seat) = seats.claim(kind, Class::Stop) {
                 inside.push(seat);
             }
             inside.len() - before
@@ -144,7 +144,7 @@ mod tests {
         for kind in 4..24 {
             assert!(fill(kind) > 0, "kind {kind} finds no room");
         }
-        assert_eq!(Seats::sharing(1, 4, 16).take(0, Class::Stop).map(drop), Ok(()));
+        assert_eq!(Seats::sharing(1, 4, 16).claim(0, Class::Stop).map(drop), Ok(()));
     }
 
     #[test]
@@ -152,22 +152,22 @@ mod tests {
         let seats = Seats::new(10, 10);
         let mut inside = Vec::new();
         let mut fill = |class| {
-            while let Ok(seat) = seats.take("a", class) {
+            while let Ok(seat) = seats.claim("a", class) {
                 inside.push(seat);
             }
             inside.len()
         };
         assert_eq!(Class::ALL.map(&mut fill), [6, 7, 8, 9, 10]);
         inside.truncate(6);
-        assert_eq!(seats.take("b", Class::Bulk).err(), Some(Full::Total));
-        assert!(seats.take("b", Class::Status).is_ok());
+        assert_eq!(seats.claim("b", Class::Bulk).err(), Some(Full::Total));
+        assert!(seats.claim("b", Class::Status).is_ok());
     }
 
     #[test]
     fn nothing_is_kept_of_those_who_left() {
         let seats = Seats::new(10, 10);
         for kind in 0..1000 {
-            drop(seats.take(kind, Class::Stop).expect("room"));
+            drop(seats.claim(kind, Class::Stop).expect("room"));
         }
         let taken = seats.taken();
         assert_eq!((taken.total, taken.kinds.len()), (0, 0));

@@ -6,7 +6,7 @@
 //! 3. After a conflict, or where nobody knows what came of an item, the picture is not trusted any more.
 
 use crate::reconcile::{Loop, Replies};
-use crate::{Asked, Request};
+use crate::requests::{Asked, Request};
 use midshift_core::fleet::projection::named;
 use midshift_core::fleet::{Plan, obeyed, put_right, refusals};
 use midshift_core::limits;

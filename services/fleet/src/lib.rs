@@ -7,26 +7,26 @@ mod commit;
 mod encode;
 mod grpc;
 mod reconcile;
+mod requests;
 mod retention;
 mod standby;
 
+pub use requests::{MapOutdated, Parts};
 pub use retention::prune;
 
 use midshift_core::Boxed;
 use midshift_core::fleet::Board;
 use midshift_core::fleet::commands::Command;
-use midshift_core::fleet::maps::MapChange;
 use midshift_core::fleet::projection::View;
 use midshift_core::identity::Caller;
 use midshift_core::limits;
-use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::Revision;
 use midshift_core::site::Site;
-use midshift_core::time::{Clock, Now};
-use midshift_core::work::Live;
+use midshift_core::time::Now;
 use midshift_proto::fleet::v1::fleet_service_server::FleetServiceServer;
-use midshift_store::{LiveBoard, Store};
-use std::fmt;
+use midshift_store::Store;
+use requests::{Asked, Request};
 use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
@@ -35,64 +35,6 @@ use tonic::service::Routes;
 
 /// Requests that may wait for the reconciler; one more is told to come back.
 const REQUESTS_MAX: usize = 256;
-
-/// What the service is built from.
-pub struct Parts {
-    /// The memory that services share.
-    pub store: Arc<dyn Store>,
-    /// Newest heartbeats, written by telemetry.
-    pub board: Arc<LiveBoard<Live>>,
-    /// The site.
-    pub site: Arc<Site>,
-    /// Its text, kept in the store.
-    pub site_text: String,
-    /// What became of the map that this process was started with.
-    pub map: MapChange,
-    /// Where the time of the wall, the link and the site is read.
-    pub clock: Arc<dyn Clock>,
-    /// Naive rules for twins of tests; none outside them.
-    pub bugs: midshift_core::fleet::bugs::Bugs,
-}
-
-/// The reconciler began to lead, and the map that its process chose at its start is none to plan on any more: another one was stored since,
-/// or something came in its way. The process chooses anew when it is started again.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct MapOutdated(pub Reason);
-
-impl fmt::Display for MapOutdated {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "the map that was chosen at the start is outdated, start again: {} {:?}",
-            self.0.code, self.0.metadata
-        )
-    }
-}
-
-impl std::error::Error for MapOutdated {}
-
-/// A question about the picture as it is now.
-type Look = Box<dyn FnOnce(&View, &Board, &Now) + Send>;
-
-/// Something a person asks of the reconciler.
-enum Request {
-    /// Change something; answered after the commit.
-    Do(Box<Asked>),
-    /// Look at something.
-    Look(Look),
-}
-
-/// A command, until it is answered.
-struct Asked {
-    command: Command,
-    seen: Option<Revision>,
-    validate_only: bool,
-    by: Caller,
-    request_id: Option<String>,
-    reply: oneshot::Sender<Result<(), Refusal>>,
-    /// How often it was decided and lost, because what it is about had been changed meanwhile.
-    lost: u32,
-}
 
 /// The service. Cheap to clone: all clones talk to one reconciler.
 #[derive(Clone)]

@@ -6,7 +6,7 @@
 //! Invariant: the view has absorbed the feed up to a head of it before anything is planned on it, never a part of a commit; only a process that leads plans, and one that could not
 //! say so for a while reads the rows again before it does.
 
-use crate::{Asked, Look, MapOutdated, Parts, Request};
+use crate::requests::{Asked, Look, MapOutdated, Parts, Request};
 use midshift_core::fleet::projection::{self, View};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, explain, found, maps, objects};
 use midshift_core::identity::Actor;

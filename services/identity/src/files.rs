@@ -2,7 +2,7 @@
 //!
 //! Invariant: a key is never in a file that anybody but its owner may read, not even for a moment.
 
-use crate::Error;
+use crate::error::Error;
 use std::fs::{DirBuilder, File, Permissions};
 use std::io::{self, Read};
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};

@@ -2,7 +2,8 @@
 
 use crate::authority::{Authority, Signed, asked};
 use crate::register::decided;
-use crate::tokens::{self, Turn, Wanted};
+use crate::tokens::rotate::{self, Turn};
+use crate::tokens::{self, Wanted};
 use crate::{Error, IdentityService, encode};
 use midshift_core::audit::Note;
 use midshift_core::identity::{Caller, Replace, RobotIdentity, Secret, TokenId, Who};
@@ -73,7 +74,7 @@ impl IdentityService {
 
     async fn turn_token(&self, r: v1::RotateTokenRequest, actor: &Caller) -> Result<v1::RotateTokenResponse, Refusal> {
         let turn = Turn::check(&r)?;
-        let (record, secret) = tokens::rotate(&self.0.register, &turn, &actor.into(), self.now()).await?;
+        let (record, secret) = rotate::rotate(&self.0.register, &turn, &actor.into(), self.now()).await?;
         self.recorded().await?;
         let secret = secret.map(|secret| secret.reveal(Secret::TOKEN)).unwrap_or_default();
         Ok(v1::RotateTokenResponse { token: Some(encode::token(&record)), secret })

@@ -6,6 +6,7 @@
 pub mod audit;
 mod authority;
 mod encode;
+mod error;
 mod files;
 mod grpc;
 mod machines;
@@ -17,18 +18,19 @@ mod revocation_list;
 mod tokens;
 
 pub use authority::PUBLIC_FILE;
+pub use error::Error;
 pub use files::{FOLDER, make_folder};
 pub use proof::ServerProof;
 pub use retention::prune;
 pub use revocation_list::RevocationList;
 
 use authority::{Authority, asked};
+use error::ANSWERED_WITHIN;
 use midshift_core::Boxed;
 use midshift_core::audit::Note;
 use midshift_core::identity::{Authority as AuthorityRow, Directory, Secret, ServerCertificate, revocations};
 use midshift_core::ids::SiteId;
 use midshift_core::limits;
-use midshift_core::reason::Refusal;
 use midshift_core::time::{Clock, Utc};
 use midshift_proto::identity::v1::enrolment_service_server::EnrolmentServiceServer;
 use midshift_proto::identity::v1::identity_service_server::IdentityServiceServer;
@@ -45,72 +47,6 @@ use tonic::service::Routes;
 
 /// Rows are looked at so often although nobody woke us, link clock: time alone changes who is known.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
-/// A process waits so long at its start for whoever has the authority.
-const ANSWERED_WITHIN: Duration = Duration::from_secs(120);
-
-/// Why identity cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// A file or folder.
-    #[error("{path}: {source}", path = path.display())]
-    Folder {
-        /// Where the file or folder is.
-        path: PathBuf,
-        /// What the operating system said.
-        source: std::io::Error,
-    },
-    /// A folder or file with keys or other secrets that others may look into.
-    #[error("{path} has keys or other secrets and is open to others (mode {mode:03o}): type `chmod go= {path}`, after asking who may have read it", path = path.display())]
-    Open {
-        /// The folder or file that others may look into.
-        path: PathBuf,
-        /// Its mode.
-        mode: u32,
-    },
-    /// A key or certificate on disk.
-    #[error("{path} is no key and certificate of this build: {source}", path = path.display())]
-    Unreadable {
-        /// The file with the key or certificate.
-        path: PathBuf,
-        /// Why it could not be read.
-        source: rcgen::Error,
-    },
-    /// A name that the server is to be called.
-    #[error("a name of the server is none: {source}")]
-    Names {
-        /// Why no certificate can have it.
-        source: rcgen::Error,
-    },
-    /// A key or signature could not be made.
-    #[error("making a key or a certificate: {0}")]
-    Signing(#[source] rcgen::Error),
-    /// The store has a root and the folder has none, or another one.
-    #[error("the store knows another root certificate of this site than {path} has: bring that folder back from a backup; robots and people trust the root in the store", path = path.display())]
-    OtherAuthority {
-        /// The folder.
-        path: PathBuf,
-    },
-    /// Nobody answered.
-    #[error("no process with role identity signed this server's certificate within {} s: start one on the same store", ANSWERED_WITHIN.as_secs())]
-    NotAnswered,
-    /// A line of a list of revocations.
-    #[error("line {line} of {path} is no revocation that this release knows: {source}", path = path.display())]
-    Line {
-        /// Of which list.
-        path: PathBuf,
-        /// Which, from 1.
-        line: usize,
-        /// What the reader of JSON says.
-        source: serde_json::Error,
-    },
-    /// The store.
-    #[error("reading who is known: {0}")]
-    Store(#[source] midshift_store::Error),
-    /// A decision was refused.
-    #[error(transparent)]
-    Refused(#[from] Refusal),
-}
-
 /// What identity is made of.
 pub struct Parts {
     /// Where its keys are, for its owner alone; made if it is not there.

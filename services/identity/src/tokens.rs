@@ -2,9 +2,7 @@
 //!
 //! Invariant: of the tokens that stand no two are made of one name, also by two processes at once: who makes one writes the row of its name as it was read.
 
-mod rotate;
-
-pub use rotate::{Turn, rotate};
+pub mod rotate;
 
 use crate::register::{Register, View, decided};
 use midshift_core::audit::Note;

@@ -105,7 +105,7 @@ pub struct Report {
     pub canceled: usize,
     /// See above.
     pub expired: usize,
-    /// NEEDS_OPERATOR.
+    /// Tasks that ended in NEEDS_OPERATOR.
     pub to_operator: usize,
     /// In one of the states that lead on.
     pub open: usize,

@@ -299,7 +299,7 @@ impl Running<'_> {
         };
         let ear = async {
             if let (Some(telemetry), Some(socket)) = (self.telemetry.clone(), self.beacons) {
-                telemetry.hear(socket).await;
+                telemetry.hear_beacons(socket).await;
             }
             Ok(())
         };

@@ -27,7 +27,7 @@ pub(crate) struct Grown {
 
 impl Growth {
     /// What stands beside the note before it may share its row.
-    pub(crate) fn take(&mut self, draft: Draft) {
+    pub(crate) fn add(&mut self, draft: Draft) {
         let own = match self.0.last_mut() {
             Some(last) if last.writer == draft.writer => last.join(draft),
             _ => Some(draft),

@@ -37,7 +37,7 @@ impl Gathered {
         Self { named, rows: Vec::new(), known: BTreeSet::new(), asked: 0, wanted, of_parents, parented: 0 }
     }
 
-    pub(crate) fn take(&mut self, rows: impl IntoIterator<Item = Row>) {
+    pub(crate) fn add(&mut self, rows: impl IntoIterator<Item = Row>) {
         for row in rows {
             if self.known.insert(row.key.clone()) {
                 self.rows.push(row);

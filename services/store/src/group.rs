@@ -61,7 +61,7 @@ impl Group {
         self.entries.extend(decided.entries);
         self.head = decided.applied.seq;
         if let Some(draft) = decided.audited {
-            self.growth.take(draft);
+            self.growth.add(draft);
         }
         Ok(decided.applied)
     }

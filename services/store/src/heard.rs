@@ -66,7 +66,7 @@ pub fn follow_heard(log: Arc<dyn HeardLog>, board: Arc<LiveBoard<Live>>, clock: 
     Box::pin(async move {
         let mut position = None;
         loop {
-            match look(log.as_ref(), position, &board, clock.as_ref()).await {
+            match read_newest(log.as_ref(), position, &board, clock.as_ref()).await {
                 Ok(read) => {
                     position = Some(read);
                     board.set_read_up_to(read);
@@ -78,7 +78,7 @@ pub fn follow_heard(log: Arc<dyn HeardLog>, board: Arc<LiveBoard<Live>>, clock: 
     })
 }
 
-async fn look(
+async fn read_newest(
     log: &dyn HeardLog,
     after: Option<u64>,
     board: &LiveBoard<Live>,

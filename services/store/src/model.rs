@@ -97,7 +97,7 @@ impl State {
         let decided = decide(item, self.head, at_unix_ms, |key| self.row(key).map(|row| row.revision))?;
         for after in decided.rows {
             match after {
-                After::Row(row) => self.tables.entry(row.key.table).or_default().put(row),
+                After::Row(row) => self.tables.entry(row.key.table).or_default().insert(row),
                 After::Gone(key) => self.tables.entry(key.table).or_default().delete(&key.id),
             }
         }
@@ -110,7 +110,7 @@ impl State {
         }
         self.head = decided.applied.seq;
         if let Some(draft) = decided.audited {
-            self.growth.take(draft);
+            self.growth.add(draft);
         }
         Ok(decided.applied)
     }
@@ -122,7 +122,7 @@ impl State {
         }
         let grown = std::mem::take(&mut self.growth).grow(&mut self.chains);
         for row in grown.rows {
-            self.tables.entry(row.key.table).or_default().put(row);
+            self.tables.entry(row.key.table).or_default().insert(row);
         }
         for (table, up_to) in grown.cuts {
             self.tables.entry(table).or_default().delete_up_to(up_to.cast_signed());
@@ -194,9 +194,9 @@ impl Store for MemoryStore {
         let mut gathered = Gathered::new(parts, named);
         for part in parts {
             match part {
-                Part::Whole(table) => gathered.take(state.tables.get(table).into_iter().flat_map(Rows::iter).cloned()),
+                Part::Whole(table) => gathered.add(state.tables.get(table).into_iter().flat_map(Rows::iter).cloned()),
                 Part::InStates(table, states) => {
-                    gathered.take(state.tables.get(table).into_iter().flat_map(|rows| rows.in_states(states)).cloned());
+                    gathered.add(state.tables.get(table).into_iter().flat_map(|rows| rows.in_states(states)).cloned());
                 }
                 Part::Rows(_) | Part::OfParents { .. } => {}
             }
@@ -206,7 +206,7 @@ impl Store for MemoryStore {
             let is_whole = parents.is_empty();
             for (table, parent) in parents {
                 let rows = state.tables.get(&table).into_iter().flat_map(|rows| rows.of_parent(&parent));
-                gathered.take(rows.cloned());
+                gathered.add(rows.cloned());
             }
             let missing = gathered.missing();
             if missing.is_empty() && is_whole {
@@ -214,7 +214,7 @@ impl Store for MemoryStore {
             }
             for (table, ids) in missing {
                 let rows = ids.iter().filter_map(|id| state.tables.get(&table)?.get(id));
-                gathered.take(rows.cloned());
+                gathered.add(rows.cloned());
             }
         }
     }

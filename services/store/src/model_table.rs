@@ -38,7 +38,7 @@ impl Rows {
         self.by_parent.get(parent).into_iter().flatten().filter_map(|place| self.rows.get(&place.id))
     }
 
-    pub(crate) fn put(&mut self, row: Row) {
+    pub(crate) fn insert(&mut self, row: Row) {
         let place = Cursor::of(&row);
         let index = row.index.clone();
         match self.rows.insert(row.key.id.clone(), row) {

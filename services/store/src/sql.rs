@@ -217,8 +217,3 @@ where
 {
     Ok(Seq(row.try_get::<i64, _>(column)?.cast_unsigned()))
 }
-
-/// A name for a store that no other store has.
-pub(crate) fn fresh_id() -> String {
-    format!("{:032x}", rand::random::<u128>())
-}

@@ -70,13 +70,13 @@ impl<'a> Batch<'a> {
     async fn commit_each(&mut self, mut waiting: mpsc::Receiver<Waiting>) -> Result<(), Refusal> {
         while let Some((message, room)) = waiting.recv().await {
             drop(room);
-            self.take(message.item.unwrap_or_default()).await?;
+            self.take_item(message.item.unwrap_or_default()).await?;
         }
         Ok(())
     }
 
     /// Takes the next item; what came before is committed first if the slice is full or the item depends on it.
-    async fn take(&mut self, request: v1::SubmitTaskRequest) -> Result<(), Refusal> {
+    async fn take_item(&mut self, request: v1::SubmitTaskRequest) -> Result<(), Refusal> {
         if self.results.len() + self.slice.len() >= limits::SUBMIT_ITEMS_MAX {
             return Err(Refusal::field("item", "at most 10000 a call; what came before was admitted"));
         }

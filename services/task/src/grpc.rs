@@ -23,7 +23,7 @@ const REQUEST_ID_HEADER: &str = "x-request-id";
 pub struct CallId(String);
 
 impl CallId {
-    fn of<T>(request: &Request<T>, own: &str) -> Self {
+    fn of_request<T>(request: &Request<T>, own: &str) -> Self {
         let named = |text: &str| RequestId::parse(text).is_ok().then(|| text.to_owned());
         let header = |map: &MetadataMap| map.get(REQUEST_ID_HEADER).and_then(|v| named(v.to_str().ok()?));
         let id = named(own).or_else(|| header(request.metadata()));
@@ -63,7 +63,7 @@ impl Face for TaskService {
     type WatchTasksStream = Reader<v1::WatchTasksResponse>;
 
     async fn submit_task(&self, r: Request<v1::SubmitTaskRequest>) -> Result<Response<v1::SubmitTaskResponse>, Status> {
-        let id = CallId::of(&r, &r.get_ref().request_id);
+        let id = CallId::of_request(&r, &r.get_ref().request_id);
         let (by, denying) = (caller(&r), Denying::of(&r));
         id.answer(self.submit(r.into_inner(), &by).await.inspect_err(|refusal| denying.tell(refusal)))
     }
@@ -71,7 +71,7 @@ impl Face for TaskService {
         &self,
         r: Request<Streaming<v1::SubmitTasksRequest>>,
     ) -> Result<Response<v1::SubmitTasksResponse>, Status> {
-        let (id, by, denying) = (CallId::of(&r, ""), caller(&r), Denying::of(&r));
+        let (id, by, denying) = (CallId::of_request(&r, ""), caller(&r), Denying::of(&r));
         let results = Batch::new(self, &by, denying).run(r.into_inner()).await.map_err(|broken| match broken {
             Broken::Stream(status) => status,
             Broken::Refused(refusal) => id.status(&refusal),
@@ -79,44 +79,44 @@ impl Face for TaskService {
         Ok(Response::new(v1::SubmitTasksResponse { results }))
     }
     async fn get_task(&self, r: Request<v1::GetTaskRequest>) -> Result<Response<v1::GetTaskResponse>, Status> {
-        let (id, by) = (CallId::of(&r, ""), caller(&r));
+        let (id, by) = (CallId::of_request(&r, ""), caller(&r));
         id.answer(self.get(r.into_inner(), &by).await)
     }
     async fn list_tasks(&self, r: Request<v1::ListTasksRequest>) -> Result<Response<v1::ListTasksResponse>, Status> {
-        let (id, by) = (CallId::of(&r, ""), caller(&r));
+        let (id, by) = (CallId::of_request(&r, ""), caller(&r));
         id.answer(self.list(r.into_inner(), &by).await)
     }
     async fn cancel_task(&self, r: Request<v1::CancelTaskRequest>) -> Result<Response<v1::CancelTaskResponse>, Status> {
-        let (id, by) = (CallId::of(&r, &r.get_ref().request_id), caller(&r));
+        let (id, by) = (CallId::of_request(&r, &r.get_ref().request_id), caller(&r));
         id.answer(self.cancel(r.into_inner(), &by).await)
     }
     async fn resolve_task(
         &self,
         r: Request<v1::ResolveTaskRequest>,
     ) -> Result<Response<v1::ResolveTaskResponse>, Status> {
-        let (id, by) = (CallId::of(&r, &r.get_ref().request_id), caller(&r));
+        let (id, by) = (CallId::of_request(&r, &r.get_ref().request_id), caller(&r));
         id.answer(self.resolve(r.into_inner(), &by).await)
     }
     async fn cancel_tasks(
         &self,
         r: Request<v1::CancelTasksRequest>,
     ) -> Result<Response<v1::CancelTasksResponse>, Status> {
-        let (id, by) = (CallId::of(&r, &r.get_ref().request_id), caller(&r));
+        let (id, by) = (CallId::of_request(&r, &r.get_ref().request_id), caller(&r));
         id.answer(self.cancel_many(r.into_inner(), &by).await)
     }
     async fn resolve_tasks(
         &self,
         r: Request<v1::ResolveTasksRequest>,
     ) -> Result<Response<v1::ResolveTasksResponse>, Status> {
-        let (id, by) = (CallId::of(&r, &r.get_ref().request_id), caller(&r));
+        let (id, by) = (CallId::of_request(&r, &r.get_ref().request_id), caller(&r));
         id.answer(self.resolve_many(r.into_inner(), &by).await)
     }
     async fn resume_held(&self, r: Request<v1::ResumeHeldRequest>) -> Result<Response<v1::ResumeHeldResponse>, Status> {
-        let (id, by) = (CallId::of(&r, &r.get_ref().request_id), caller(&r));
+        let (id, by) = (CallId::of_request(&r, &r.get_ref().request_id), caller(&r));
         id.answer(self.resume(r.into_inner(), &by).await)
     }
     async fn watch_tasks(&self, r: Request<v1::WatchTasksRequest>) -> Result<Response<Self::WatchTasksStream>, Status> {
-        let (id, by) = (CallId::of(&r, ""), caller(&r));
+        let (id, by) = (CallId::of_request(&r, ""), caller(&r));
         let (teller, reader) = watches::watch();
         let watcher = self.watcher(r.into_inner(), by, teller).map_err(|refusal| id.status(&refusal))?;
         tokio::spawn(watcher.run(id));

@@ -105,7 +105,7 @@ impl Images {
 
     /// Takes one entry; if it changed a task, that task with its attempt as this change left both. In an item of fleet the attempt
     /// comes first.
-    pub fn take(&mut self, entry: &Entry) -> Result<Option<Image<'_>>, BadRow> {
+    pub fn absorb(&mut self, entry: &Entry) -> Result<Option<Image<'_>>, BadRow> {
         if let Some(attempt) = read::<Attempt>(entry)? {
             if attempt.attempt.subject.task_id().is_some() {
                 self.attempts.insert(attempt.attempt.clone(), attempt);

@@ -43,7 +43,7 @@ impl Wish {
             Self::Resolve(_) => matches!(phase, Phase::NeedsOperator),
         }
     }
-    fn of(self, task: &TaskRows) -> Ask {
+    fn to_ask(self, task: &TaskRows) -> Ask {
         let task_id = task.state.task_id.clone();
         match self {
             Self::Cancel { force } => Ask::Cancel { task_id, force },
@@ -200,7 +200,7 @@ impl TaskService {
             let refusal = self.acts_on(task, by, bulk.permission).and_then(|()| bulk.wish.fits(task)).err();
             let own_id = bulk.request_id.as_ref().map(|id| format!("{id}/{}", task.state.task_id));
             let asked = Asked {
-                ask: bulk.wish.of(task),
+                ask: bulk.wish.to_ask(task),
                 reason: bulk.reason.clone(),
                 request_id: own_id.and_then(|id| RequestId::parse(&id).ok()),
                 hash: bulk.hash.clone(),

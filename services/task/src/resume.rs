@@ -41,7 +41,7 @@ struct Named {
 
 impl Named {
     /// None: it names no fleet stop, or tasks or an area whose robots only fleet knows.
-    fn of(ask: &Ask) -> Option<Self> {
+    fn from_ask(ask: &Ask) -> Option<Self> {
         let Ask::ResumeHeld { stop_id: Some(stop_id), area_id: None, task_ids, robot_ids } = ask else { return None };
         let stop_id = StopId::parse(stop_id).ok()?;
         task_ids.is_empty().then(|| Self { stop_id, robot_ids: robot_ids.clone() })
@@ -99,7 +99,7 @@ impl TaskService {
                 self.must_be_known(&named).await?;
             }
         }
-        let named = Named::of(&ask).filter(|_| earlier.is_none());
+        let named = Named::from_ask(&ask).filter(|_| earlier.is_none());
         let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.into(), robot_id: None };
         let held = match &named {
             None => None,

@@ -194,7 +194,7 @@ impl Watcher {
     }
 
     async fn change(&mut self, entry: &Entry) -> Result<(), Stop> {
-        let Image { intake, state, attempt } = match self.images.take(entry) {
+        let Image { intake, state, attempt } = match self.images.absorb(entry) {
             Ok(Some(image)) => image,
             Ok(None) => return Ok(()),
             Err(error) => {

@@ -3,10 +3,10 @@
 //! Invariant: a hint for display, never evidence. Nobody proves anything with a datagram: anybody in the network can send one, so nothing is
 //! decided by it, nothing is written down, and only robots that once said Hello have one. Called by the binary.
 
-use crate::Inner;
+use crate::picture::Picture;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
-use midshift_core::time::{LinkDuration, LinkTime, Now};
+use midshift_core::time::{Clock, LinkDuration, LinkTime, Now};
 use midshift_proto::convert;
 use midshift_proto::telemetry::v1;
 use std::collections::BTreeMap;
@@ -81,7 +81,13 @@ impl Ear {
     }
 
     /// Takes a datagram in; the robot it is about, if it was one that counts.
-    fn take(&self, datagram: &[u8], from: IpAddr, now: LinkTime, knows: impl Fn(&RobotId) -> bool) -> Option<RobotId> {
+    fn take_in(
+        &self,
+        datagram: &[u8],
+        from: IpAddr,
+        now: LinkTime,
+        knows: impl Fn(&RobotId) -> bool,
+    ) -> Option<RobotId> {
         let mut state = self.state();
         if now.since(state.window) >= WINDOW {
             state.window = now;
@@ -133,7 +139,7 @@ fn is_fresh(heard: &Heard, now: LinkTime) -> bool {
 }
 
 /// Listens until it is dropped.
-pub async fn listen(inner: &Inner, socket: &UdpSocket) {
+pub async fn listen(ear: &Ear, picture: &Picture, clock: &dyn Clock, socket: &UdpSocket) {
     // One byte more than a beacon has: a longer one is seen to be too long.
     let mut datagram = [0; limits::BEACON_BYTES + 1];
     loop {
@@ -145,13 +151,13 @@ pub async fn listen(inner: &Inner, socket: &UdpSocket) {
                 continue;
             }
         };
-        let now = inner.parts.clock.now().link;
-        let knows = |robot_id: &RobotId| inner.picture.rows().sessions.contains_key(robot_id);
-        let taken = inner.ear.take(&datagram[..length], from.ip(), now, knows);
+        let now = clock.now().link;
+        let knows = |robot_id: &RobotId| picture.rows().sessions.contains_key(robot_id);
+        let taken = ear.take_in(&datagram[..length], from.ip(), now, knows);
         let counted = if taken.is_some() { "taken" } else { "dropped" };
         metrics::counter!("midshift_beacons_total", "what" => counted).increment(1);
         if let Some(robot_id) = taken {
-            inner.picture.touch(&robot_id);
+            picture.touch(&robot_id);
         }
     }
 }
@@ -172,7 +178,7 @@ mod tests {
     }
 
     fn hears(ear: &Ear, text: &str, ms: u64) -> bool {
-        ear.take(text.as_bytes(), FROM, LinkTime(ms), |id| id.as_str().starts_with("r")).is_some()
+        ear.take_in(text.as_bytes(), FROM, LinkTime(ms), |id| id.as_str().starts_with("r")).is_some()
     }
 
     #[test]
@@ -232,7 +238,7 @@ mod tests {
         assert!(hears(&ear, "midshift-beacon 1 r1 v1 1 7\n", 1_000), "the next second");
         let sources = (0..2 * limits::BEACON_SOURCES_MAX as u32).map(|n| IpAddr::V4(n.into()));
         let heard = sources
-            .filter(|from| ear.take(b"midshift-beacon 1 r1 v1 1 7\n", *from, LinkTime(1_500), |_| true).is_some());
+            .filter(|from| ear.take_in(b"midshift-beacon 1 r1 v1 1 7\n", *from, LinkTime(1_500), |_| true).is_some());
         assert_eq!(heard.count(), limits::BEACON_SOURCES_MAX - 1, "sources of one second are counted too");
         assert_eq!(ear.state().heard.len(), 1);
     }
@@ -242,7 +248,7 @@ mod tests {
         let ear = Ear::default();
         let take = |n: usize, ms: u64| {
             let text = format!("midshift-beacon 1 r{n} v1 1 7\n");
-            ear.take(text.as_bytes(), IpAddr::V4((n as u32 % 1_000).into()), LinkTime(ms), |_| true).is_some()
+            ear.take_in(text.as_bytes(), IpAddr::V4((n as u32 % 1_000).into()), LinkTime(ms), |_| true).is_some()
         };
         assert!((0..limits::BEACONS_MAX).all(|n| take(n, 1_000 + n as u64 / 5)));
         let full = 1_000 + limits::BEACONS_MAX as u64 / 5;

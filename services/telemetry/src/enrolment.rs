@@ -4,8 +4,9 @@
 //! newest machine. Its machine is observed, people are told, and it takes charge once it is adopted. Invariant: the rows are asked, at each Hello: no picture of
 //! them can be late. Where nobody shows a certificate there is no enrolment, and nothing is asked.
 
-use crate::Inner;
-use crate::second::{Second, state};
+use crate::facts::state;
+use crate::inner::Inner;
+use crate::second::Second;
 use midshift_core::fleet::NOT_ENROLLED_SEEN;
 use midshift_core::identity::{Caller, Digest, RobotIdentity};
 use midshift_core::ids::RobotId;

@@ -4,8 +4,8 @@
 //! acknowledgement leaves only after the commit; a poison sample is recorded, acknowledged and skipped; what finds no room
 //! to wait is passed over, and asked for again once there is some.
 
-use crate::Inner;
 use crate::bugs::Bugs;
+use crate::inner::Inner;
 use midshift_core::ids::RobotId;
 use midshift_core::robot::Lane;
 use midshift_core::rows::{Expect, Fact, Item, Log, Revision, Writer};

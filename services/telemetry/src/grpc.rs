@@ -1,6 +1,7 @@
 //! Robots and their events for people and programs: decode, look at the picture and the board, encode.
 
-use crate::{Inner, TelemetryService};
+use crate::TelemetryService;
+use crate::inner::Inner;
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;

@@ -8,7 +8,9 @@ mod ear;
 mod enrolment;
 mod event_rate;
 mod events;
+mod facts;
 mod grpc;
+mod inner;
 mod link;
 mod misreads;
 mod offset;
@@ -23,20 +25,21 @@ mod session;
 mod shared;
 mod status;
 mod stops;
+mod waits;
 mod welcome;
 
 pub use bugs::Bugs;
 #[cfg(feature = "seeded-bugs")]
 pub use bugs::SeededBug;
+pub use inner::Parts;
 pub use retention::prune;
 
-use midshift_core::time::Clock;
-use midshift_core::work::Live;
+use inner::Inner;
 use midshift_core::{Boxed, limits};
 use midshift_proto::link::v1::link_service_server::LinkServiceServer;
 use midshift_proto::link::v1::replay_service_server::ReplayServiceServer;
 use midshift_proto::telemetry::v1::telemetry_service_server::TelemetryServiceServer;
-use midshift_store::{Error, FrameLog, HeardLog, LiveBoard, Store};
+use midshift_store::Error;
 use picture::Picture;
 use registry::Registry;
 use std::sync::Arc;
@@ -44,38 +47,6 @@ use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding;
 use tonic::service::Routes;
-
-/// What the service is built from.
-pub struct Parts {
-    /// The memory that services share.
-    pub store: Arc<dyn Store>,
-    /// Where STATUS is kept.
-    pub frames: Arc<dyn FrameLog>,
-    /// Newest heartbeats, read by fleet.
-    pub board: Arc<LiveBoard<Live>>,
-    /// Where other processes read them, if any may open the store too.
-    pub heard: Option<Arc<dyn HeardLog>>,
-    /// Where the time of the wall, the link and the site is read.
-    pub clock: Arc<dyn Clock>,
-    /// Naive rules for twins of tests; none outside them.
-    pub bugs: Bugs,
-}
-
-pub(crate) struct Inner {
-    pub parts: Parts,
-    pub picture: Picture,
-    pub registry: Registry,
-    pub event_rates: event_rate::EventRates,
-    /// Robots that are refused because of what they say.
-    pub misreads: misreads::Misreads,
-    pub ear: ear::Ear,
-    pub shared: Option<shared::Shared>,
-    /// Room for robots that say hello.
-    pub hellos: Arc<Semaphore>,
-    /// Robots are asked to go to another gateway, and no new one is taken.
-    pub moving: CancellationToken,
-    pub shutdown: CancellationToken,
-}
 
 /// The service. Cheap to clone.
 #[derive(Clone)]
@@ -121,12 +92,12 @@ impl TelemetryService {
         })
     }
     /// Listens for the beacons of launchers on `socket` until shutdown: hints for people, which nobody proves and nothing is decided by.
-    pub fn hear(self, socket: tokio::net::UdpSocket) -> Boxed<'static, ()> {
+    pub fn hear_beacons(self, socket: tokio::net::UdpSocket) -> Boxed<'static, ()> {
         let inner = self.inner;
         Box::pin(async move {
             tokio::select! {
                 () = inner.shutdown.cancelled() => {}
-                () = ear::listen(&inner, &socket) => {}
+                () = ear::listen(&inner.ear, &inner.picture, inner.parts.clock.as_ref(), &socket) => {}
             }
         })
     }
@@ -136,9 +107,9 @@ impl TelemetryService {
         Box::pin(async move {
             tokio::select! {
                 () = inner.shutdown.cancelled() => Ok(()),
-                result = picture::keep(&inner) => result,
-                () = presence::keep(&inner) => Ok(()),
-                () = shared::keep(&inner) => Ok(()),
+                result = picture::keeper::follow_rows(&inner) => result,
+                () = presence::write_presence(&inner) => Ok(()),
+                () = shared::keep_heartbeats(inner.shared.as_ref(), &inner.parts.board, &inner.picture) => Ok(()),
             }
         })
     }

@@ -1,6 +1,6 @@
 //! The robots' face: reads the Hello, sends the Welcome, runs the session.
 
-use crate::misreads::count_misread;
+use crate::facts::count_misread;
 use crate::session::{self, Down};
 use crate::{TelemetryService, welcome};
 use midshift_core::identity::Caller;

@@ -1,30 +1,23 @@
-//! Counts by robot how often it dialled and was refused because what it said could not be read, and states it for people when that goes on.
+//! Counts by robot how often it dialled and was refused because what it said could not be read, so that people are told when that goes on.
 //!
-//! Called by `link` for a Hello, by `session` for what follows. Invariant: of one robot at most one fact a minute, whatever it sends.
+//! Invariant: of one robot at most one fact a minute, whatever it sends.
 
-use crate::Inner;
-use crate::second::state;
-use midshift_core::fleet::NOT_UNDERSTOOD_SEEN;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 use tokio::time::Instant;
-use tracing::field::Empty;
 
 /// Robots that are counted at once: where nobody logs in, names cost nothing.
 const ROBOTS_MAX: usize = 1_024;
-/// Bytes that are told of what was wrong.
-const WHY_BYTES_MAX: usize = 300;
-
 /// Since when each robot is counted, and how often it was refused since. Volatile.
 #[derive(Debug, Default)]
 pub struct Misreads(Mutex<BTreeMap<RobotId, (Instant, u32)>>);
 
 impl Misreads {
     /// Counts one. Whether people should hear of it now.
-    fn count(&self, robot_id: &RobotId, now: Instant) -> bool {
+    pub fn count(&self, robot_id: &RobotId, now: Instant) -> bool {
         let within = Duration::from_millis(limits::MISREADS_WITHIN.as_ms());
         let mut robots = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         robots.retain(|_, (since, _)| now < *since + within);
@@ -35,21 +28,6 @@ impl Misreads {
         *times += 1;
         *times == limits::MISREADS_TOLD
     }
-}
-
-/// A robot was refused because of what it said.
-pub fn count_misread(inner: &Arc<Inner>, robot_id: &RobotId, why: &str) {
-    if !inner.misreads.count(robot_id, Instant::now()) {
-        return;
-    }
-    let why = &why[..why.floor_char_boundary(WHY_BYTES_MAX)];
-    tracing::warn!(peer = Empty, %robot_id, why, "a robot dials again and again and is refused each time");
-    let body = serde_json::json!({ "robot_id": robot_id, "why": why });
-    let (inner, robot_id) = (inner.clone(), robot_id.clone());
-    // The stream of the robot may be gone before it is written.
-    tokio::spawn(async move {
-        state(&inner, &robot_id, NOT_UNDERSTOOD_SEEN, &body).await;
-    });
 }
 
 #[cfg(test)]

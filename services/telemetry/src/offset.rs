@@ -16,7 +16,7 @@ pub struct Offset {
 
 impl Offset {
     /// Takes a complete sample; one that says that time ran backwards on the wire is passed over.
-    pub fn take(&mut self, sample: ClockSample) {
+    pub fn add(&mut self, sample: ClockSample) {
         if sample.delay_us() < 0 || sample.t4_us == 0 {
             return;
         }
@@ -39,11 +39,11 @@ mod tests {
     #[test]
     fn the_quickest_exchange_is_believed() {
         let mut offset = Offset::default();
-        offset.take(ClockSample { t1_us: 0, t2_us: 900_000, t3_us: 900_000, t4_us: 1_000_000 });
-        offset.take(ClockSample { t1_us: 5_000_000, t2_us: 4_801_000, t3_us: 4_801_000, t4_us: 5_002_000 });
+        offset.add(ClockSample { t1_us: 0, t2_us: 900_000, t3_us: 900_000, t4_us: 1_000_000 });
+        offset.add(ClockSample { t1_us: 5_000_000, t2_us: 4_801_000, t3_us: 4_801_000, t4_us: 5_002_000 });
         assert_eq!(offset.estimate(), Some((200, 2)));
         for _ in 0..SAMPLES {
-            offset.take(ClockSample { t1_us: 0, t2_us: 10_000, t3_us: 10_000, t4_us: 20_000 });
+            offset.add(ClockSample { t1_us: 0, t2_us: 10_000, t3_us: 10_000, t4_us: 20_000 });
         }
         assert_eq!(offset.estimate(), Some((0, 11)));
     }
@@ -51,7 +51,7 @@ mod tests {
     #[test]
     fn an_exchange_that_took_less_than_no_time_is_passed_over() {
         let mut offset = Offset::default();
-        offset.take(ClockSample { t1_us: 100, t2_us: 0, t3_us: 500, t4_us: 101 });
+        offset.add(ClockSample { t1_us: 100, t2_us: 0, t3_us: 500, t4_us: 101 });
         assert_eq!(offset.estimate(), None);
     }
 }

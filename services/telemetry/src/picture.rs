@@ -2,26 +2,19 @@
 //!
 //! Invariant: telemetry only composes and sends desired state; it never changes or re-dates it.
 
-use crate::Inner;
+pub mod keeper;
+
 use crate::stops::SiteStops;
-use midshift_core::fleet::rows::{RobotControl, SiteRow};
-use midshift_core::ids::{AreaId, RobotId, StopId, WaypointId};
-use midshift_core::rows::{BadRow, Seq, Table};
-use midshift_core::site::{Site, text};
-use midshift_core::stop::record::StopRecord;
+use midshift_core::fleet::rows::RobotControl;
+use midshift_core::ids::{AreaId, RobotId, WaypointId};
+use midshift_core::rows::Seq;
+use midshift_core::site::Site;
 use midshift_core::update::DesiredUpdate;
 use midshift_core::work::{DesiredPolicy, DesiredWork, LaneMark, Live, PresenceRow, Session};
-use midshift_store::{Change, Dirty, Error, Fold, LeftOut, LiveBoard, Projection};
+use midshift_store::{Dirty, LiveBoard};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
-use std::time::Duration;
 use tokio::sync::watch;
-use tokio::time::Instant;
-
-/// Pause before a store that failed is read again.
-const STORE_RETRY: Duration = Duration::from_millis(200);
-/// How often it is read anew how far other gateways have kept STATUS.
-const MARKS_EVERY: Duration = Duration::from_secs(5);
 
 /// Desired state of one robot, section by section.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -146,142 +139,5 @@ impl Picture {
             *old = sections;
             changed
         });
-    }
-}
-
-struct Keeper {
-    inner: Arc<Inner>,
-    /// Rows with a word of a newer version: what they are about gets nothing new, and everything else goes on.
-    left_out: LeftOut,
-}
-
-fn sections<'a>(rows: &'a mut Rows, robot_id: &RobotId) -> &'a mut Sections {
-    rows.desired.entry(robot_id.clone()).or_default()
-}
-
-impl Fold for Keeper {
-    fn tables() -> &'static [Table] {
-        &[
-            Table::DesiredWork,
-            Table::DesiredPolicy,
-            Table::DesiredUpdate,
-            Table::Session,
-            Table::RobotControl,
-            Table::Presence,
-            Table::LaneMark,
-            Table::Site,
-            Table::StopRecord,
-        ]
-    }
-    fn reset(&mut self) {
-        let mut rows = self.inner.picture.rows_mut();
-        let status = std::mem::take(&mut rows.status);
-        *rows = Rows { status, ..Rows::default() };
-    }
-    fn apply(&mut self, change: Change) -> Result<(), BadRow> {
-        if change.key.table == Table::Site {
-            self.inner.picture.rows_mut().site =
-                self.left_out.read_change::<SiteRow>(&change)?.and_then(|row| map_of(&row));
-            return Ok(());
-        }
-        let id = change.key.id.to_string();
-        if change.key.table == Table::StopRecord {
-            let Ok(stop_id) = StopId::parse(&id) else { return Ok(()) };
-            let record = self.left_out.read_change::<StopRecord>(&change)?.map(Arc::new);
-            put(Arc::make_mut(&mut self.inner.picture.rows_mut().stops), stop_id, record);
-            return Ok(());
-        }
-        let Ok(robot_id) = RobotId::parse(id.split('/').next().unwrap_or_default()) else { return Ok(()) };
-        let mut rows = self.inner.picture.rows_mut();
-        match change.key.table {
-            Table::DesiredWork => {
-                sections(&mut rows, &robot_id).work = self.left_out.read_change(&change)?.map(Arc::new)
-            }
-            Table::DesiredPolicy => {
-                sections(&mut rows, &robot_id).policy = self.left_out.read_change(&change)?.map(Arc::new)
-            }
-            Table::DesiredUpdate => {
-                sections(&mut rows, &robot_id).update = self.left_out.read_change(&change)?.map(Arc::new)
-            }
-            Table::Session => put(&mut rows.sessions, robot_id.clone(), self.left_out.read_change(&change)?),
-            Table::RobotControl => put(&mut rows.control, robot_id.clone(), self.left_out.read_change(&change)?),
-            Table::Presence => put(&mut rows.presence, robot_id.clone(), self.left_out.read_change(&change)?),
-            Table::LaneMark => put(&mut rows.marks, id, self.left_out.read_change(&change)?),
-            _ => {}
-        }
-        drop(rows);
-        match change.key.table {
-            Table::DesiredWork | Table::DesiredPolicy | Table::DesiredUpdate => self.inner.picture.publish(&robot_id),
-            Table::Session => {
-                let newest = self.inner.picture.rows().sessions.get(&robot_id).map(|s| s.session_epoch);
-                self.inner.registry.fence(&robot_id, newest.unwrap_or(0));
-                self.inner.picture.touch(&robot_id);
-            }
-            // A label may let it into what somebody watches, or out of it.
-            Table::Presence | Table::RobotControl => self.inner.picture.touch(&robot_id),
-            _ => {}
-        }
-        Ok(())
-    }
-}
-
-fn map_of(row: &SiteRow) -> Option<Arc<Site>> {
-    let read = text::parse(&row.text);
-    if read.is_err() {
-        tracing::warn!(site_id = %row.site_id, "the map cannot be read: robots are shown to those only that see the whole site");
-    }
-    read.ok().map(Arc::new)
-}
-
-fn put<K: Ord, V>(map: &mut BTreeMap<K, V>, key: K, value: Option<V>) {
-    match value {
-        Some(value) => map.insert(key, value),
-        None => map.remove(&key),
-    };
-}
-
-/// Keeps the picture until the store's wakes end.
-pub async fn keep(inner: &Arc<Inner>) -> Result<(), Error> {
-    let mut wake = inner.parts.store.wake();
-    load_status(inner).await;
-    let mut read_marks = Instant::now();
-    let mut projection = Projection::new(Keeper { inner: inner.clone(), left_out: LeftOut::default() });
-    loop {
-        wake.mark_unchanged();
-        match projection.advance(inner.parts.store.as_ref()).await {
-            Ok(_) => {
-                inner.picture.publish_stops();
-                inner.picture.absorbed.send_replace(projection.seq());
-                inner.picture.ready.send_if_modified(|ready| !std::mem::replace(ready, true));
-            }
-            Err(error) => {
-                tracing::warn!(%error, "telemetry cannot read the store, trying again");
-                tokio::time::sleep(STORE_RETRY).await;
-                continue;
-            }
-        }
-        if wake.changed().await.is_err() {
-            return Ok(());
-        }
-        // Other gateways keep STATUS too; for people only, since a session asks for its own ring when it begins.
-        if inner.shared.is_some() && read_marks.elapsed() >= MARKS_EVERY {
-            read_marks = Instant::now();
-            load_status(inner).await;
-        }
-    }
-}
-
-async fn load_status(inner: &Inner) {
-    match inner.parts.frames.marks().await {
-        Ok(marks) => {
-            let mut rows = inner.picture.rows_mut();
-            for mark in marks {
-                let known = rows.status.entry((mark.robot_id, mark.ring)).or_default();
-                *known = mark.seq.max(*known);
-            }
-        }
-        Err(error) => {
-            tracing::warn!(%error, "status marks cannot be read: robots will send from where they think best")
-        }
     }
 }

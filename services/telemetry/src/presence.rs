@@ -3,7 +3,7 @@
 //! Invariant: nobody's clock but ours takes part; a store that fails costs one period. Of several gateways the one that had the robot's
 //! newest session writes at once, the others a little later if it has not.
 
-use crate::Inner;
+use crate::inner::Inner;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::robot::Presence;
@@ -21,7 +21,7 @@ const PERIOD: Duration = Duration::from_millis(500);
 const ROWS_PER_ITEM: usize = 200;
 
 /// Presence by the age of the newest heartbeat.
-pub fn of(heard: Option<LinkTime>, now: LinkTime) -> Presence {
+pub fn presence_of(heard: Option<LinkTime>, now: LinkTime) -> Presence {
     match heard.map(|at| now.since(at)) {
         Some(age) if age <= limits::SUSPECT_AFTER => Presence::Online,
         Some(age) if age <= limits::OFFLINE_AFTER => Presence::Suspect,
@@ -53,7 +53,7 @@ async fn read(store: &dyn Store) -> Option<Known> {
 }
 
 /// Keeps presence until it is dropped.
-pub async fn keep(inner: &Inner) {
+pub async fn write_presence(inner: &Inner) {
     let (mut known, mut stood): (Option<Known>, Stood) = (None, Stood::new());
     let started = inner.parts.clock.now().link;
     let mut tick = tokio::time::interval(PERIOD);
@@ -82,7 +82,7 @@ async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: Lin
         .into_iter()
         .filter_map(|robot_id| {
             let live = heard.get(&robot_id).map(AsRef::as_ref);
-            let presence = of(live.map(|live| live.processed_at), now.link);
+            let presence = presence_of(live.map(|live| live.processed_at), now.link);
             let old = known.get(&robot_id);
             let is_ours = inner.shared.is_none() || inner.registry.is_home(&robot_id);
             let is_news = |row: &PresenceRow| is_ours && live.is_some_and(|live| is_news(row, live));
@@ -147,11 +147,11 @@ mod tests {
     #[test]
     fn presence_follows_the_age_of_the_newest_heartbeat() {
         let now = LinkTime(100_000);
-        let at = |age_ms: u64| of(Some(LinkTime(100_000 - age_ms)), now);
+        let at = |age_ms: u64| presence_of(Some(LinkTime(100_000 - age_ms)), now);
         assert_eq!(
             [at(3_000), at(3_001), at(31_000), at(31_001)],
             [Presence::Online, Presence::Suspect, Presence::Suspect, Presence::Offline]
         );
-        assert_eq!(of(None, now), Presence::Offline);
+        assert_eq!(presence_of(None, now), Presence::Offline);
     }
 }

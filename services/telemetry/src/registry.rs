@@ -3,15 +3,28 @@
 //!
 //! Invariant: a session that did not prove its succession is never in charge while the older one is heard.
 
-use crate::replay::{self, Replay};
 use midshift_core::identity::SessionSecret;
 use midshift_core::ids::RobotId;
+use midshift_core::reason::Refusal;
 use midshift_core::time::{LinkTime, Utc};
+use midshift_proto::session::{LaneAck, LaneBatch};
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
+
+/// Batches that may wait for the task of one session, beside the one that it has.
+const REPLAYS_WAITING_MAX: usize = 1;
+
+/// One batch for a session in charge.
+#[derive(Debug)]
+pub struct Replay {
+    /// Samples and gaps of one lane.
+    pub batch: LaneBatch,
+    /// Who waits for what becomes of it; dropped if the session ends before.
+    pub answer: oneshot::Sender<Result<LaneAck, Refusal>>,
+}
 
 /// One session in charge.
 #[derive(Clone, Debug)]
@@ -33,7 +46,7 @@ pub struct InCharge {
 impl InCharge {
     /// Begins at `now`; and where its task finds replays.
     pub fn new(session_epoch: u64, secret: SessionSecret, now: LinkTime) -> (Self, mpsc::Receiver<Replay>) {
-        let (replays, waiting) = mpsc::channel(replay::WAITING_MAX);
+        let (replays, waiting) = mpsc::channel(REPLAYS_WAITING_MAX);
         let this = Self {
             session_epoch,
             secret,
@@ -45,7 +58,7 @@ impl InCharge {
         (this, waiting)
     }
     /// Notes a heartbeat.
-    pub fn hear(&self, now: LinkTime) {
+    pub fn note_heard(&self, now: LinkTime) {
         self.heard.store(now.0, Relaxed);
     }
     /// Newest heartbeat.

@@ -4,28 +4,17 @@
 //! durable; a batch that cannot be handed over is refused, never kept waiting. Called by robots.
 
 use crate::TelemetryService;
+use crate::registry::Replay;
 use midshift_core::identity::Caller;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_proto::access::caller;
 use midshift_proto::link::v1::replay_service_server::ReplayService;
 use midshift_proto::link::v1::{ReplayStatusRequest, ReplayStatusResponse};
-use midshift_proto::session::{LaneAck, LaneBatch, StatusReplay};
+use midshift_proto::session::{LaneAck, StatusReplay};
 use midshift_proto::{Denying, parse, status};
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::oneshot;
 use tonic::{Request, Response, Status};
-
-/// Batches that may wait for the task of one session, beside the one that it has.
-pub const WAITING_MAX: usize = 1;
-
-/// One batch for a session in charge.
-#[derive(Debug)]
-pub struct Replay {
-    /// Samples and gaps of one lane.
-    pub batch: LaneBatch,
-    /// Who waits for what becomes of it; dropped if the session ends before.
-    pub answer: oneshot::Sender<Result<LaneAck, Refusal>>,
-}
 
 fn not_in_charge() -> Refusal {
     Refusal::new(Kind::Precondition, Reason::new(Code::Fenced, "no session of this epoch and secret is in charge here"))

@@ -5,13 +5,13 @@
 //! until then that robot may still work, in its places, behind a gap in the network.
 //! Invariant: nobody is told of a robot that restarted or moved, and none of the two is told apart by what it could have copied.
 
-use crate::Inner;
+use crate::facts::state;
+use crate::inner::Inner;
 use midshift_core::fleet::CLONE_SEEN;
 use midshift_core::identity::Caller;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
-use midshift_core::rows::{Fact, Item, Log, Writer};
 use midshift_core::time::LinkTime;
 use midshift_proto::session::Hello;
 use std::sync::Arc;
@@ -45,7 +45,7 @@ impl Second {
             tokio::time::sleep(Duration::from_millis(limits::HEARTBEAT.as_ms())).await;
             let Some(heard) = self.older_heard(&inner) else { return };
             if !is_told && heard.since(self.since) >= limits::CLONE_SURE_AFTER {
-                is_told = self.tell(&inner).await;
+                is_told = self.record_clone(&inner).await;
             }
         }
     }
@@ -63,7 +63,7 @@ impl Second {
     }
 
     /// Whether it is on record, for fleet to make an incident of it.
-    async fn tell(&self, inner: &Inner) -> bool {
+    async fn record_clone(&self, inner: &Inner) -> bool {
         let Self { robot_id, boot_id, certificate, .. } = self;
         let certificate = certificate.as_deref();
         tracing::warn!(peer = Empty, %robot_id, boot_id, certificate, "two machines with the name of one robot are alive: the second is observed only");
@@ -75,25 +75,6 @@ impl Second {
             metrics::counter!("midshift_telemetry_clones_total").increment(1);
         }
         is_told
-    }
-}
-
-/// Whether a fact about a machine is on record, for fleet to make an incident of it.
-pub async fn state(inner: &Inner, robot_id: &RobotId, kind: &'static str, body: &serde_json::Value) -> bool {
-    let mut item = Item::new(Writer::Telemetry, robot_id.as_str());
-    item.facts.push(Fact {
-        log: Log::Telemetry,
-        subject: Arc::from(robot_id.as_str()),
-        kind,
-        body: Arc::from(body.to_string()),
-    });
-    match inner.parts.store.commit(vec![item]).await.pop() {
-        Some(Ok(_)) => true,
-        Some(Err(error)) => {
-            tracing::warn!(peer = %robot_id, %error, "a machine could not be recorded yet");
-            false
-        }
-        None => false,
     }
 }
 

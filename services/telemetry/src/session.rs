@@ -3,18 +3,19 @@
 //!
 //! Invariant: the stream is always drained; what is on its way to the store never holds up an echo.
 
-use crate::Inner;
 use crate::enrolment::Waits;
 use crate::event_rate::{self, lock};
 use crate::events::{Batch, Events, Outcome, commit};
-use crate::misreads::count_misread;
+use crate::facts::count_misread;
+use crate::inner::Inner;
 use crate::offset::Offset;
 use crate::picture::Sections;
-use crate::registry::InCharge;
-use crate::replay::{Replay, overloaded};
+use crate::registry::{InCharge, Replay};
+use crate::replay::overloaded;
 use crate::shared::{News, Shared};
 use crate::status::{self, Arrived, StatusLane};
 use crate::stops::StopNews;
+use crate::waits::{finish, is_cut_off, next_replay, sleep_until, until_over};
 use crate::welcome::Begun;
 use midshift_core::fleet::REPORT_TOO_LONG;
 use midshift_core::ids::RobotId;
@@ -36,7 +37,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
-use tokio::sync::{mpsc, oneshot, watch};
+use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 use tonic::{Status, Streaming};
 use tracing::field::Empty;
@@ -198,29 +199,29 @@ impl Session {
                     Err(_) => return End::Gone,
                 },
                 facts = self.stops.next(&self.robot_id), if self.out.stops.is_none() => {
-                    self.say(|out| out.stops = Some(facts));
+                    self.change_out(|out| out.stops = Some(facts));
                 }
-                told = poll(&mut self.telling), if self.telling.is_some() => if !told {
+                told = finish(&mut self.telling), if self.telling.is_some() => if !told {
                     self.too_long = None;
                 },
-                outcome = poll(&mut self.committing), if self.committing.is_some() => self.committed(outcome),
-                kept = poll(&mut self.keeping), if self.keeping.is_some() => self.status_kept(kept),
+                outcome = finish(&mut self.committing), if self.committing.is_some() => self.committed(outcome),
+                kept = finish(&mut self.keeping), if self.keeping.is_some() => self.status_kept(kept),
                 message = up.message() => match message {
                     Ok(Some(message)) => {
-                        if let Some(end) = self.take(message) {
+                        if let Some(end) = self.take_message(message) {
                             return end;
                         }
                     }
                     Ok(None) => return End::Gone,
                     Err(status) => return self.broken(&status),
                 },
-                replay = next(&mut self.replays), if self.replaying.is_none() => self.replay(replay),
+                replay = next_replay(&mut self.replays), if self.replaying.is_none() => self.replay(replay),
                 changed = desired.changed(), if self.in_charge.is_some() => {
                     if changed.is_err() {
                         return End::Gone;
                     }
                     let sections = desired.borrow_and_update().clone();
-                    self.say(|out| {
+                    self.change_out(|out| {
                         out.work = sections.work.as_deref().cloned();
                         out.policy = sections.policy.as_deref().cloned();
                         out.update = sections.update.as_deref().cloned();
@@ -232,10 +233,10 @@ impl Session {
                 () = is_cut_off(&mut cut_off) => {
                     return close(CloseCode::MoveOver, Code::StoreUnavailable, CUT_OFF_RETRY);
                 }
-                () = at(unread_at) => return close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)),
-                () = at(ack_at) => self.ack_status(),
-                () = at(rate_at) => {}
-                () = at(moves_until) => return close(CloseCode::MoveOver, Code::MoveOver, LinkDuration(0)),
+                () = sleep_until(unread_at) => return close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)),
+                () = sleep_until(ack_at) => self.ack_status(),
+                () = sleep_until(rate_at) => {}
+                () = sleep_until(moves_until) => return close(CloseCode::MoveOver, Code::MoveOver, LinkDuration(0)),
                 () = &mut moves, if moves_until.is_none() => {
                     moves_until = Some(Instant::now() + MOVE_OVER_WITHIN);
                     self.move_over(down);
@@ -264,7 +265,7 @@ impl Session {
         let _ = down.try_send(Ok((&message).into()));
     }
 
-    fn say(&mut self, change: impl FnOnce(&mut Downlink)) {
+    fn change_out(&mut self, change: impl FnOnce(&mut Downlink)) {
         change(&mut self.out);
         // What says nothing is not sent, and nobody is too slow for it.
         if self.out != Downlink::default() {
@@ -281,7 +282,7 @@ impl Session {
         out
     }
 
-    fn take(&mut self, mut message: v1::SessionRequest) -> Option<End> {
+    fn take_message(&mut self, mut message: v1::SessionRequest) -> Option<End> {
         if let Some(list) = midshift_proto::convert::session::drop_long_heartbeat(&mut message) {
             self.heartbeat_too_long(list);
         }
@@ -336,7 +337,7 @@ impl Session {
         let now = self.inner.parts.clock.now();
         let t2_us = now.wall.0 * 1000;
         if let Some(sample) = heartbeat.clock {
-            self.offset.take(sample);
+            self.offset.add(sample);
         }
         let mut report = heartbeat.reported;
         report.session_epoch = self.epoch;
@@ -354,7 +355,7 @@ impl Session {
         }
         metrics::counter!("midshift_telemetry_heartbeats_total").increment(1);
         let Some(in_charge) = &self.in_charge else { return };
-        in_charge.hear(now.link);
+        in_charge.note_heard(now.link);
         let live = Live {
             robot_id: self.robot_id.clone(),
             report,
@@ -371,10 +372,10 @@ impl Session {
         match &self.inner.shared {
             None => {
                 self.inner.parts.board.put(&self.robot_id, live);
-                self.say(|out| out.echo = Some(echo));
+                self.change_out(|out| out.echo = Some(echo));
             }
             Some(shared) => {
-                shared.take(live, &self.kept.0);
+                shared.queue(live, &self.kept.0);
                 self.unechoed.push_back(echo);
                 if self.unechoed.len() > UNECHOED_MAX {
                     self.unechoed.pop_front();
@@ -391,7 +392,7 @@ impl Session {
                 let upto = self.unechoed.iter().take_while(|echo| echo.hb <= hb).count();
                 let newest = self.unechoed.drain(..upto).next_back();
                 if newest.is_some() {
-                    self.say(|out| out.echo = newest);
+                    self.change_out(|out| out.echo = newest);
                 }
             }
         }
@@ -419,7 +420,7 @@ impl Session {
         let acks: Vec<LaneAck> =
             arrived.expect.into_iter().chain(naive.into_iter().flatten()).chain(known.into_iter().flatten()).collect();
         if !acks.is_empty() {
-            self.say(|out| out.acks.extend(acks));
+            self.change_out(|out| out.acks.extend(acks));
         }
     }
 
@@ -428,11 +429,11 @@ impl Session {
         match self.arrive(batch) {
             Arrived::Taken if self.inner.parts.bugs.status_ack_before_write() => {
                 let seq = batch.items.iter().map(|item| status::numbers(item).1).max().unwrap_or(0);
-                self.say(|out| out.acks.push(LaneAck { lane: Lane::Status, seq, expect: None }));
+                self.change_out(|out| out.acks.push(LaneAck { lane: Lane::Status, seq, expect: None }));
             }
             Arrived::Taken => {}
             Arrived::Known => self.ack_status(),
-            Arrived::Expect(ack) => self.say(|out| out.acks.push(ack)),
+            Arrived::Expect(ack) => self.change_out(|out| out.acks.push(ack)),
             Arrived::OverCredit => {
                 tracing::warn!(peer = Empty, robot_id = %self.robot_id, "session ended by status beyond its credit");
                 return Some(close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)));
@@ -470,12 +471,12 @@ impl Session {
         }
         let asked = self.events.ask_again();
         if !asked.is_empty() {
-            self.say(|out| out.acks.extend(asked));
+            self.change_out(|out| out.acks.extend(asked));
         }
         if self.keeping.is_none()
             && let Some(write) = self.status.next_write()
         {
-            self.keeping = Some(Box::pin(status::keep(self.inner.parts.frames.clone(), write)));
+            self.keeping = Some(Box::pin(status::write_frames(self.inner.parts.frames.clone(), write)));
         }
     }
 
@@ -524,18 +525,18 @@ impl Session {
                 lock(&self.rate).spend(facts);
                 self.events.done(mark);
                 let acks = self.events.acks();
-                self.say(|out| out.acks.extend(acks));
+                self.change_out(|out| out.acks.extend(acks));
             }
             Outcome::Again(mark, revision) => {
                 let acks = self.events.reset(mark, revision);
-                self.say(|out| out.acks.extend(acks));
+                self.change_out(|out| out.acks.extend(acks));
             }
             // Nothing is acknowledged; what arrives next finds the store again or not.
             Outcome::Lost => {
                 let acks = self.events.acks();
                 let again = acks.map(|ack| LaneAck { expect: Some(ack.seq + 1), ..ack });
                 self.events.forget_taken();
-                self.say(|out| out.acks.extend(again));
+                self.change_out(|out| out.acks.extend(again));
             }
         }
     }
@@ -556,60 +557,13 @@ impl Session {
                 if let Some((_, answer)) = self.replaying.take() {
                     drop(answer.send(Err(Refusal::new(Kind::Unavailable, Code::StoreUnavailable))));
                 }
-                self.say(|out| out.acks.push(ack));
+                self.change_out(|out| out.acks.push(ack));
             }
         }
     }
 
     fn ack_status(&mut self) {
         let ack = self.status.ack();
-        self.say(|out| out.acks.push(ack));
-    }
-}
-
-/// The database that several processes share has not been reached for long; never, if there is none.
-async fn is_cut_off(cut_off: &mut Option<watch::Receiver<bool>>) {
-    match cut_off {
-        // The sender lives as long as the service.
-        Some(cut_off) => drop(cut_off.wait_for(|cut_off| *cut_off).await),
-        None => std::future::pending().await,
-    }
-}
-
-/// What a session waits for has come; never, if it waits for nothing.
-async fn until_over(inner: Arc<Inner>, waits: Option<Waits>) {
-    match waits {
-        Some(waits) => waits.until_over(inner).await,
-        None => std::future::pending().await,
-    }
-}
-
-async fn at(moment: Option<Instant>) {
-    match moment {
-        Some(moment) => tokio::time::sleep_until(moment).await,
-        None => std::future::pending().await,
-    }
-}
-
-/// The next replay; never, if there can be none. The session holds a sender itself, so there is always another.
-async fn next(replays: &mut Option<mpsc::Receiver<Replay>>) -> Replay {
-    match replays {
-        Some(replays) => match replays.recv().await {
-            Some(replay) => replay,
-            None => std::future::pending().await,
-        },
-        None => std::future::pending().await,
-    }
-}
-
-/// Waits for a write under way and takes it away.
-async fn poll<T>(slot: &mut Option<Boxed<T>>) -> T {
-    match slot {
-        Some(write) => {
-            let done = write.await;
-            *slot = None;
-            done
-        }
-        None => std::future::pending().await,
+        self.change_out(|out| out.acks.push(ack));
     }
 }

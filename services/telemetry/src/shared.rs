@@ -4,10 +4,10 @@
 //! had been decided by then has gone down before it. So nobody ever knows less of a robot than it relies on, and a gateway that cannot
 //! reach the database extends no authority; when that lasts, its sessions end and its robots go to another.
 
-use crate::Inner;
+use crate::picture::Picture;
 use midshift_core::ids::RobotId;
 use midshift_core::work::Live;
-use midshift_store::{Heard, HeardLog, Kept};
+use midshift_store::{Heard, HeardLog, Kept, LiveBoard};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -52,13 +52,13 @@ pub struct Shared {
 }
 
 impl Shared {
-    /// Nothing is kept before [`keep`] runs.
+    /// Nothing is kept before [`keep_heartbeats`] runs.
     pub fn new(log: Arc<dyn HeardLog>) -> Self {
         let (waiting, queue) = mpsc::channel(WAITING_MAX);
         Self { log, waiting, queue: Mutex::new(Some(queue)), cut_off: watch::Sender::new(false) }
     }
     /// Takes a heartbeat; `session` hears what becomes of it, or nothing.
-    pub fn take(&self, live: Arc<Live>, session: &mpsc::Sender<News>) {
+    pub fn queue(&self, live: Arc<Live>, session: &mpsc::Sender<News>) {
         if self.waiting.try_send(Waiting { live, session: session.clone() }).is_err() {
             metrics::counter!("midshift_telemetry_heartbeats_dropped_total").increment(1);
         }
@@ -70,9 +70,9 @@ impl Shared {
 }
 
 /// Keeps heartbeats until it is dropped.
-pub async fn keep(inner: &Inner) {
+pub async fn keep_heartbeats(shared: Option<&Shared>, board: &LiveBoard<Live>, picture: &Picture) {
     let queue = |shared: &Shared| shared.queue.lock().unwrap_or_else(PoisonError::into_inner).take();
-    let Some((shared, mut queue)) = inner.shared.as_ref().and_then(|s| Some((s, queue(s)?))) else {
+    let Some((shared, mut queue)) = shared.and_then(|s| Some((s, queue(s)?))) else {
         return std::future::pending().await;
     };
     let mut reached = Instant::now();
@@ -85,7 +85,7 @@ pub async fn keep(inner: &Inner) {
                 reached = Instant::now();
                 shared.cut_off.send_if_modified(|cut_off| std::mem::replace(cut_off, false));
                 if let Some(kept) = kept {
-                    tell(inner, batch, &kept).await;
+                    publish_kept(board, picture, batch, &kept).await;
                 }
             }
             failed => {
@@ -130,16 +130,16 @@ async fn write(log: &dyn HeardLog, batch: &BTreeMap<RobotId, Waiting>) -> Result
 }
 
 /// Puts what was kept on the board and tells its sessions, once what had been decided before has come down to them.
-async fn tell(inner: &Inner, batch: BTreeMap<RobotId, Waiting>, kept: &Kept) {
+async fn publish_kept(board: &LiveBoard<Live>, picture: &Picture, batch: BTreeMap<RobotId, Waiting>, kept: &Kept) {
     let (fenced, heard): (Vec<_>, Vec<_>) = batch.into_values().partition(|w| kept.fenced.contains(&w.live.robot_id));
     for waiting in &heard {
-        inner.parts.board.put(&waiting.live.robot_id, waiting.live.clone());
+        board.put(&waiting.live.robot_id, waiting.live.clone());
     }
     for waiting in fenced {
         // A session that does not read has ended, or hears it with its next heartbeat.
         let _ = waiting.session.try_send(News::Fenced);
     }
-    let absorbed = inner.picture.absorbed(kept.head);
+    let absorbed = picture.absorbed(kept.head);
     if tokio::time::timeout(PICTURE_WITHIN, absorbed).await.is_err() {
         tracing::warn!("heartbeats are not echoed: what was decided meanwhile cannot be read");
         return;

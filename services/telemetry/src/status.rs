@@ -172,7 +172,7 @@ impl StatusLane {
 
 /// Keeps gaps and frames, gaps first: frames move the mark that says what need not come again. The number up to which all is durable
 /// then, or none if it is not.
-pub async fn keep(log: Arc<dyn FrameLog>, write: Write) -> Option<u64> {
+pub async fn write_frames(log: Arc<dyn FrameLog>, write: Write) -> Option<u64> {
     let last = write.frames.last().map_or(0, |f| f.last_seq);
     let gaps = write.gaps.len() as u64;
     let kept = async {

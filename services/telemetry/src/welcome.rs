@@ -1,9 +1,8 @@
 //! The beginning of a session: checks the Hello, tells a succession from a clone, and makes the new epoch durable before the Welcome.
 
-use crate::Inner;
 use crate::enrolment::{Enrolment, Waits, accepts, known_device_key};
-use crate::registry::InCharge;
-use crate::replay::Replay;
+use crate::inner::Inner;
+use crate::registry::{InCharge, Replay};
 use crate::second::{Second, heard_elsewhere, in_gap};
 use midshift_bundle::installed::{self, Rejection};
 use midshift_core::identity::{Caller, SessionSecret};

@@ -1,15 +1,18 @@
 //! A robot that behaves badly: what one seed lets it say is legal by link.v1 and may be late, repeated, contradictory or impossible.
 //!
 //! Invariant: every message can be read by the rules of the wire; only what it says is wrong. Nothing here does IO or reads a clock, so the
-//! same seed says the same in the simulation and over a socket. `habits` are what is wrong with it, `work` is what it does of its work,
+//! same seed says the same in the simulation and over a socket. `habit` and `habits` are what is wrong with it, `work` is what it does of its work,
 //! `line` carries its words.
 
+mod habit;
 mod habits;
+mod job;
 pub mod line;
 mod work;
 
-pub use habits::Habit;
+pub use habit::Habit;
 
+use job::Job;
 use midshift_core::ids::{AttemptId, PlaceId, RobotId, TaskId, WaypointId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Reason};
@@ -25,7 +28,6 @@ use rand::rngs::StdRng;
 use rand::seq::{IndexedRandom, IteratorRandom};
 use rand::{RngExt, SeedableRng};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use work::Job;
 
 /// Samples that it keeps until they are acknowledged; what comes after is forgotten.
 const KEPT_MAX: usize = 512;

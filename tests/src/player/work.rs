@@ -2,7 +2,9 @@
 //!
 //! It has no body: it says of itself what a robot would say that does the work, and is nowhere else than where it says that it is.
 
-use super::{Habit, Player};
+use super::Player;
+use super::habit::Habit;
+use super::job::Job;
 use midshift_core::ids::{AttemptId, PlaceId};
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{FAULT_SEMANTIC, Fault, FaultClass, Load, ReportedAttempt, WorkState};
@@ -11,14 +13,6 @@ use midshift_core::work::{
 };
 use rand::RngExt;
 use rand::seq::IndexedRandom;
-
-/// An attempt that it took.
-pub(super) struct Job {
-    pub(super) assignment: Assignment,
-    pub(super) step: u32,
-    /// It is done with the step at hand then, milliseconds.
-    due: u64,
-}
 
 impl Player {
     /// Hears what it should do.

@@ -3,8 +3,25 @@
 use crate::{files, read, root};
 use std::path::Path;
 
-/// Longest line, in characters. A table is as wide as its cells, and a line of code as long as what is typed.
+/// Longest line, in characters.
 const LINE_MAX: usize = 120;
+/// Pages that programs write.
+const GENERATED: [&str; 1] = ["docs/cli.md"];
+/// Rows of tables and lines of code that are still longer, by page. It only shrinks.
+const KNOWN_LONG: &[(&str, usize)] = &[
+    ("SECURITY.md", 8),
+    ("docs/audit.md", 5),
+    ("docs/clients.md", 6),
+    ("docs/glossary.md", 19),
+    ("docs/numbers.md", 9),
+    ("docs/privacy.md", 20),
+    ("docs/robot-protocol.md", 8),
+    ("docs/rows.md", 13),
+    ("docs/runbooks/backup.md", 2),
+    ("docs/runbooks/keys.md", 11),
+    ("docs/runbooks/split.md", 8),
+    ("docs/security.md", 3),
+];
 /// Most words of a page that everybody reads.
 const WORDS: [(&str, usize); 2] = [("README.md", 1_500), ("ARCHITECTURE.md", 2_500)];
 /// What entries of the changelog stand under, in this order.
@@ -14,39 +31,41 @@ const ENTRY_LINES_MAX: usize = 2;
 /// Names of README's floor, which has more than two places, and what the transcript of the command line calls the same.
 const NAMES: [(&str, &str); 4] = [("A01", "A"), ("B03", "B"), ("TASK-1", "TASK-5"), ("rbt-04", "rbt-01")];
 
-/// Pages of ours, without those that tools bring. Decision records are as they were written.
-fn pages() -> Vec<String> {
-    let all = files("", "md").into_iter();
-    all.filter(|path| !path.contains("node_modules") && !path.starts_with("docs/decisions/0")).collect()
+/// Pages of ours, without those that tools bring.
+fn all_pages() -> Vec<String> {
+    files("", "md").into_iter().filter(|path| !path.contains("node_modules")).collect()
 }
 
-/// Lines of prose that are longer than people read, by number.
+/// Pages that say how things are now: a decision record says how they were.
+fn pages() -> Vec<String> {
+    all_pages().into_iter().filter(|path| !path.starts_with("docs/decisions/0")).collect()
+}
+
+/// Lines that are longer than people read, by number.
 fn long_lines(page: &str) -> Vec<usize> {
-    let mut is_code = false;
-    let mut long = Vec::new();
-    for (n, line) in page.lines().enumerate() {
-        is_code ^= line.starts_with("```");
-        let is_prose = !is_code && !line.starts_with('|') && !line.starts_with("    ");
-        if is_prose && line.chars().count() > LINE_MAX {
-            long.push(n + 1);
-        }
-    }
-    long
+    let long = page.lines().enumerate().filter(|(_, line)| line.chars().count() > LINE_MAX);
+    long.map(|(n, _)| n + 1).collect()
 }
 
 #[test]
 fn pages_are_no_longer_than_people_read() {
-    let all = pages();
-    assert!(all.len() > 20, "{all:?}");
-    for path in all {
-        assert_eq!(long_lines(&read(&path)), Vec::<usize>::new(), "{path}");
+    let all = all_pages();
+    assert!(all.len() > 100, "{all:?}");
+    let mut wrong = Vec::new();
+    for path in all.into_iter().filter(|path| !GENERATED.contains(&path.as_str())) {
+        let long = long_lines(&read(&path));
+        let known = KNOWN_LONG.iter().find(|(known, _)| *known == path).map_or(0, |(_, count)| *count);
+        if long.len() != known {
+            wrong.push((path, known, long));
+        }
     }
+    assert!(wrong.is_empty(), "shorten what came, or lower the number: (page, known, lines) {wrong:?}");
     for (path, most) in WORDS {
         let words = read(path).split_whitespace().count();
         assert!(words <= most, "{path} has {words} words; {most} are read");
     }
     let long = "a".repeat(LINE_MAX + 1);
-    assert_eq!(long_lines(&format!("# A\n{long}\n| {long} |\n```\n{long}\n```\n{long}\n")), [2, 7]);
+    assert_eq!(long_lines(&format!("# A\n{long}\n| {long} |\n```\n{long}\n```\nb\n")), [2, 3, 5]);
 }
 
 /// What is wrong with a changelog.
@@ -94,8 +113,7 @@ fn links(page: &str) -> Vec<&str> {
 #[test]
 fn every_link_of_a_page_leads_to_a_file_or_folder() {
     let mut seen = 0;
-    let records = files("docs/decisions", "md").into_iter().filter(|path| path.starts_with("docs/decisions/0"));
-    for path in pages().into_iter().chain(records) {
+    for path in all_pages() {
         let folder = root().join(&path).parent().map(Path::to_owned).unwrap_or_default();
         let page = read(&path);
         for target in links(&page) {

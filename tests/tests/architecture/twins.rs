@@ -25,7 +25,7 @@ type Twin = (&'static str, u32, &'static str);
 
 const FLEET: &str = "services/fleet/tests/fleet/twins.rs";
 const ROLLOUTS: &str = "tests/tests/simulation/naive.rs";
-const SEEDS: &str = "tests/tests/simulation/main.rs";
+const SEEDS: &str = "tests/tests/simulation/seeds.rs";
 const AGENT: &str = "robot_agent/tests/agent/twins.rs";
 const OFFERS: &str = "robot_agent/tests/agent/offers.rs";
 const BUNDLES: &str = "ota_bundles/tests/bundle/twins.rs";

@@ -42,7 +42,7 @@ impl Method {
         methods
             .map(|is| {
                 let path = format!("/{}/{}", is.parent_service().full_name(), is.name());
-                Ok(Self { rule: access::of(&path).with_context(|| format!("{path} has no rule"))?, path, is })
+                Ok(Self { rule: access::find(&path).with_context(|| format!("{path} has no rule"))?, path, is })
             })
             .collect()
     }

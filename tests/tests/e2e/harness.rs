@@ -349,7 +349,7 @@ impl Server {
     pub fn freeze(&self) -> anyhow::Result<()> {
         self.running.signal("STOP")
     }
-    /// SIGKILL.
+    /// Ends it by SIGKILL.
     pub fn kill(&mut self) -> anyhow::Result<()> {
         self.running.kill()
     }

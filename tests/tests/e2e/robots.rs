@@ -175,7 +175,7 @@ impl Robots {
         tell_identity(&mut command, &self.server);
         Running::start(&mut command, &dir.join("agent.log"))
     }
-    /// SIGKILL.
+    /// Ends it by SIGKILL.
     pub fn kill(&mut self, id: &str) -> anyhow::Result<()> {
         self.running.get_mut(id).map_or(Ok(()), Running::kill)
     }

@@ -191,7 +191,7 @@ impl Stack {
         of_role.nth(nth).with_context(|| format!("no {role} {nth}"))
     }
 
-    /// SIGKILL.
+    /// Ends it by SIGKILL.
     pub fn kill(&mut self, role: &str, nth: usize) -> anyhow::Result<()> {
         self.member(role, nth)?.running.kill()
     }

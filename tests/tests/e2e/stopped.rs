@@ -53,7 +53,7 @@ impl StopServer {
         }
         Running::start(command.arg("--site").arg(dir.join("site.toml")), &dir.join("stop.log"))
     }
-    /// SIGKILL.
+    /// Ends it by SIGKILL.
     pub fn kill(&mut self) -> anyhow::Result<()> {
         self.running.kill()
     }

@@ -5,7 +5,7 @@
 use crate::body::WatchedBody;
 use crate::clock::{MachineClock, Skew, TrueTime};
 use crate::disk::RobotDisk;
-use crate::net::{Ear, SERVER, SimDial, Wire};
+use crate::net::{Ear, SERVER, SimDial, Wire, machine};
 use crate::newer::{Newer, Voice};
 use crate::observer::Shared;
 use crate::stops;
@@ -60,11 +60,6 @@ pub struct Agent {
     pub newer: Option<Newer>,
     /// Processes so far.
     pub lives: Arc<AtomicU64>,
-}
-
-/// Name of a robot's machine.
-pub fn machine(robot: usize) -> String {
-    format!("robot-{robot}")
 }
 
 /// How a process ended.

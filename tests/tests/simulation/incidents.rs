@@ -1,7 +1,7 @@
 //! Laws of incidents: what only a person can solve has one, and honest robots bring none of those that tell of robots that behave badly.
 
+use crate::law_names::{BOUNDED, REFUSED};
 use crate::observer::{Observer, ready};
-use crate::played::{BOUNDED, REFUSED};
 use midshift_core::fleet::rows::{HolderState, Incident, Place, RobotControl};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;

@@ -12,6 +12,7 @@ mod counted;
 mod directed;
 mod disk;
 mod incidents;
+mod law_names;
 mod laws;
 mod naive;
 mod net;
@@ -23,20 +24,18 @@ mod plan;
 mod played;
 mod room;
 mod run;
+mod seeds;
 mod skew;
 mod software;
+mod stderr;
 mod stopped;
 mod stops;
 mod wall;
 mod worker;
 mod wrong_clock;
 
-use midshift::server::Naive as Server;
-use midshift_agent::bugs::{Bugs, SeededBug};
-use midshift_core::fleet::bugs::SeededBug as Fleet;
+use seeds::{break_laws, elsewhere, every_seed_holds, hash_of, naive_of, own_seed, report_seed};
 use std::collections::BTreeMap;
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 
 /// Seeds of a plain run. Each has a process of its own, so that nothing of one run reaches another.
 const SEEDS: u64 = 120;
@@ -114,8 +113,6 @@ const LAWS: [&str; 37] = [
     "I19 nobody is given work on probation",
     "I19 permission follows the robot's own word in that drain",
 ];
-/// A naive rule must be seen to fail within this many seeds.
-const TWIN_SEEDS: u64 = 40;
 /// Each naive rule, and the law that it breaks.
 const TWINS: [(&str, &str); 6] = [
     ("claims_are_blamed", incidents::NOT_BLAMED),
@@ -126,142 +123,14 @@ const TWINS: [(&str, &str); 6] = [
     ("timeout_frees_place", "I6 floor under a robot is not given away"),
 ];
 
-fn naive_of(name: &str) -> room::Naive {
-    let agent = |bug| room::Naive { agent: Bugs::of(&[bug]), ..room::Naive::default() };
-    let server = |server| room::Naive { server, ..room::Naive::default() };
-    let fleet = |bug| server(Server { fleet: midshift_core::fleet::bugs::Bugs::of(&[bug]), ..Server::default() });
-    match name {
-        "" => room::Naive::default(),
-        "silence_frees_task" => fleet(Fleet::SilenceFreesTask),
-        "timeout_frees_place" => fleet(Fleet::TimeoutFreesPlace),
-        "doubt_is_kept_quiet" => fleet(Fleet::DoubtIsKeptQuiet),
-        "steps_are_not_told" => fleet(Fleet::StepsAreNotTold),
-        "claims_are_blamed" => fleet(Fleet::ClaimsAreBlamed),
-        "late_reports_count" => fleet(Fleet::LateReportsCount),
-        "holds_come_at_once" => fleet(Fleet::HoldsComeAtOnce),
-        "each_word_is_told" => fleet(Fleet::EachWordIsTold),
-        "success_is_believed" => fleet(Fleet::SuccessIsBelieved),
-        "fenced_reports_rebuild" => fleet(Fleet::FencedReportsRebuild),
-        "authority_from_receipt" => agent(SeededBug::AuthorityFromReceipt),
-        "grant_from_receipt" => agent(SeededBug::GrantFromReceipt),
-        "ack_before_commit" => {
-            let telemetry = midshift_telemetry::Bugs::of(&[midshift_telemetry::SeededBug::AckBeforeCommit]);
-            server(Server { telemetry, ..Server::default() })
-        }
-        other => panic!("no naive rule is called {other}"),
-    }
-}
-
-fn number(name: &str) -> Option<u64> {
-    std::env::var(name).ok()?.parse().ok()
-}
-
-fn say(text: &str) {
-    use std::io::Write;
-    let _ = writeln!(std::io::stderr(), "{text}");
-}
-
 /// The test that runs one seed of a shift with faults.
 const SHIFT: &str = "one_seed_keeps_every_law";
-
-/// Runs one seed of a test in another process; its whole output, and whether every law held.
-fn elsewhere(test: &str, seed: u64, naive: &str) -> (String, bool) {
-    let program = std::env::current_exe().expect("this test is a program");
-    let mut command = std::process::Command::new(program);
-    command.args(["--exact", test, "--nocapture"]);
-    command.env("MIDSHIFT_SIM_SEED", seed.to_string()).env("MIDSHIFT_SIM_NAIVE", naive);
-    let output = command.output().expect("a test that runs can be run again");
-    (String::from_utf8_lossy(&output.stderr).into_owned(), output.status.success())
-}
-
-/// The seed of this process. None: no seed is asked for, and seed 1 of `test` has run and held in a process of its own, since counters of
-/// the server that laws look at belong to a process.
-fn own_seed(test: &str) -> Option<u64> {
-    let seed = number("MIDSHIFT_SIM_SEED");
-    if seed.is_none() {
-        let (text, held) = elsewhere(test, 1, "");
-        assert!(held, "{text}");
-    }
-    seed
-}
-
-/// Runs seeds in processes of their own, as many at once as there are cores, until one of them `ends` it. Later ones may have run.
-fn each(test: &str, seeds: std::ops::Range<u64>, naive: &str, ends: impl Fn(u64, &str, bool) -> bool + Sync) {
-    let (next, over) = (AtomicU64::new(seeds.start), AtomicBool::new(false));
-    let at_once = std::thread::available_parallelism().map_or(2, usize::from);
-    std::thread::scope(|scope| {
-        for _ in 0..at_once {
-            scope.spawn(|| {
-                while !over.load(Relaxed) {
-                    let seed = next.fetch_add(1, Relaxed);
-                    if seed >= seeds.end {
-                        return;
-                    }
-                    let (text, held) = elsewhere(test, seed, naive);
-                    if ends(seed, &text, held) {
-                        over.store(true, Relaxed);
-                    }
-                }
-            });
-        }
-    });
-}
-
-fn hash_of(text: &str) -> Option<&str> {
-    text.lines().find(|line| line.starts_with("seed "))?.split_whitespace().nth(3)
-}
-
-/// Adds up what runs said of themselves: `check`, `count` or `hit`, a number, a name.
-fn add_up(sums: &mut BTreeMap<String, u64>, text: &str) {
-    for line in text.lines() {
-        let mut words = line.splitn(3, ' ');
-        let (Some(kind @ ("check" | "count" | "hit")), Some(n), Some(name)) =
-            (words.next(), words.next(), words.next())
-        else {
-            continue;
-        };
-        *sums.entry(format!("{kind} {name}")).or_insert(0) += n.parse::<u64>().unwrap_or(0);
-    }
-}
 
 /// What is on the lists and never happened.
 fn missed(sums: &BTreeMap<String, u64>) -> Vec<String> {
     let lists = [("hit", HITS.as_slice()), ("count", COUNTS.as_slice()), ("check", LAWS.as_slice())];
     let names = lists.into_iter().flat_map(|(kind, names)| names.iter().map(move |name| format!("{kind} {name}")));
     names.filter(|name| sums.get(name).copied().unwrap_or(0) == 0).collect()
-}
-
-/// Prints what a seed met; fails if it broke a law.
-fn report_seed(seed: u64, outcome: &run::Outcome) {
-    say(&format!("seed {seed} hash {:016x} lasted {} ms", outcome.hash, outcome.lasted_ms));
-    outcome.checks.iter().for_each(|(name, n)| say(&format!("check {n} {name}")));
-    outcome.counts.iter().for_each(|(name, n)| say(&format!("count {n} {name}")));
-    outcome.hits.iter().for_each(|(name, n)| say(&format!("hit {n} {name}")));
-    outcome.planned.iter().for_each(|(name, n)| say(&format!("planned {n} {name}")));
-    assert!(outcome.findings.is_empty(), "seed {seed}: {:#?}", outcome.findings);
-}
-
-/// Runs the seeds that the environment names, or the first `seeds`, by the test `one`. Gives how many and what they counted; fails if one broke a law.
-fn every_seed_holds(one: &str, again: &str, seeds: u64) -> (u64, BTreeMap<String, u64>) {
-    let first = number("MIDSHIFT_SEED_FROM").unwrap_or(1);
-    let many = number("MIDSHIFT_SEEDS").unwrap_or(seeds);
-    let (broken, sums) = (Mutex::new(Vec::new()), Mutex::new(BTreeMap::new()));
-    each(one, first..first + many, "", |seed, text, held| {
-        add_up(&mut sums.lock().expect("no thread panics with it"), text);
-        if !held {
-            say(text);
-            broken.lock().expect("no thread panics with it").push(seed);
-        }
-        false
-    });
-    let (broken, sums) = (broken.into_inner(), sums.into_inner());
-    let (broken, sums) = (broken.expect("no thread panics with it"), sums.expect("no thread panics with it"));
-    assert!(
-        broken.is_empty(),
-        "again: MIDSHIFT_SIM_SEED=N cargo test --workspace --test simulation {again}; broken: {broken:?}"
-    );
-    sums.iter().for_each(|(name, n)| say(&format!("{n:>10} {name}")));
-    (many, sums)
 }
 
 #[test]
@@ -285,22 +154,6 @@ fn many_seeds_keep_every_law() {
 #[test]
 fn each_naive_rule_breaks_its_law() {
     break_laws(SHIFT, &TWINS);
-}
-
-/// Runs seeds of a test with each naive rule until one breaks the law of that rule; fails if none does.
-fn break_laws(one: &str, twins: &[(&str, &str)]) {
-    for (rule, law) in twins {
-        let seen = AtomicBool::new(false);
-        each(one, 1..1 + TWIN_SEEDS, rule, |seed, text, held| {
-            let breaks = !held && text.contains(&format!("s: {law}"));
-            if breaks {
-                say(&format!("{rule}: seed {seed} breaks {law}"));
-                seen.store(true, Relaxed);
-            }
-            breaks
-        });
-        assert!(seen.into_inner(), "{TWIN_SEEDS} seeds with {rule} never broke: {law}");
-    }
 }
 
 #[test]

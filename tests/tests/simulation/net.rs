@@ -15,6 +15,11 @@ use tonic::transport::server::Connected;
 use tonic::transport::{Channel, Endpoint, Uri};
 use turmoil::net::{TcpListener, TcpStream};
 
+/// Name of a robot's machine.
+pub fn machine(robot: usize) -> String {
+    format!("robot-{robot}")
+}
+
 /// Name of the server's machine.
 pub const SERVER: &str = "server";
 /// Name of the stop service's machine.

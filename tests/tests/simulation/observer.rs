@@ -6,8 +6,9 @@
 
 use crate::changes::{Changes, Look};
 use crate::clock::TrueTime;
+use crate::law_names::{GOES_ON, ONCE};
 use crate::laws::{Grants, Offers};
-use crate::played::{GOES_ON, ONCE};
+use crate::stderr::print_line;
 use midshift_agent::store::Op;
 use midshift_agent::switch::Switch;
 use midshift_bundle::set::SetManifest;
@@ -251,7 +252,7 @@ impl Observer {
         let us = self.time.us();
         let line = format!("{us} {robot_id} {what} {switch:?}");
         if self.trace {
-            crate::say(&line);
+            print_line(&line);
         }
         self.digest(&line);
         self.count(what);
@@ -294,7 +295,7 @@ impl Observer {
         let body = entry.body.as_deref().filter(|_| !secret).unwrap_or_default();
         let line = format!("{} {subject} {} {} {body}", self.time.us(), entry.kind, entry.seq.0);
         if self.trace {
-            crate::say(&line);
+            print_line(&line);
         }
         self.digest(&line);
         match entry.table {
@@ -523,7 +524,7 @@ impl Observer {
         let kinds: String = ops.iter().map(kind).collect::<Vec<_>>().join(",");
         let line = format!("{} {robot_id} {kinds}", self.time.us());
         if self.trace {
-            crate::say(&line);
+            print_line(&line);
         }
         self.digest(&line);
         for op in ops {

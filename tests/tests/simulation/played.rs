@@ -6,12 +6,13 @@
 use crate::client::Wish;
 use crate::counted::{self, TOLD, counted};
 use crate::incidents::{self, ASKED};
+use crate::law_names::{BOUNDED, GOES_ON, ONCE, REFUSED};
 use crate::observer::{Observer, ready};
 use crate::orders::Order;
 use crate::plan::background;
 use crate::room::{Naive, Room, RoomConfig, player_machine, site};
 use crate::run::{Outcome, outcome_of};
-use crate::{every_seed_holds, hash_of, report_seed};
+use crate::seeds::{break_laws, elsewhere, every_seed_holds, hash_of, naive_of, own_seed, report_seed};
 use midshift_core::ids::{AttemptId, RobotId, TaskId};
 use midshift_core::rows::Table;
 use midshift_core::site::{DEMO, Site};
@@ -50,18 +51,9 @@ const STANDS_MS: u64 = 240_000;
 
 /// Laws beyond those of the witness, by the name under which each is looked at.
 const LAWS: [&str; 8] = [GOES_ON, BUILT_ANEW, REFUSED, BOUNDED, TOLD, ASKED, ONCE, WAS_THERE];
-/// What an honest robot works on is known, and over by its own word alone. That ready work finds it is a matter of `TOLD`: a robot that could
-/// take it is no reason for it to wait.
-pub const GOES_ON: &str = "honest robots' tasks go on";
 const BUILT_ANEW: &str = "the planner is built anew only after a conflict";
-/// Nor is it put aside: a player's words never make a decision that no store takes.
-pub const REFUSED: &str = "what the store refuses for good is not composed again";
-/// Rows, and what the words of one robot open.
-pub const BOUNDED: &str = "memory is bounded";
-/// Nobody else is given what a robot has, and no item is put down twice.
-pub const ONCE: &str = "nobody's work is given twice";
 /// Players have no bodies: of them it is where they say that they were. What bodies did with the items of honest robots is a matter of `GOES_ON`.
-pub const WAS_THERE: &str = "no task is done by a robot that was never where it ends";
+const WAS_THERE: &str = "no task is done by a robot that was never where it ends";
 
 /// Each naive rule, the law that it breaks, and the habit of every player that shows it.
 const TWINS: [(&str, &str, Habit); 8] = [
@@ -336,10 +328,10 @@ fn planned_once(metrics: &Metrics, seen: &mut Observer) {
 
 #[test]
 fn one_seed_of_robots_that_behave_badly_keeps_every_law() {
-    let Some(seed) = crate::own_seed(ONE) else { return };
+    let Some(seed) = own_seed(ONE) else { return };
     let rule = std::env::var("MIDSHIFT_SIM_NAIVE").unwrap_or_default();
     let habit = TWINS.iter().find(|(twin, ..)| *twin == rule).map(|(.., habit)| *habit);
-    let outcome = run(seed, crate::naive_of(&rule), habit);
+    let outcome = run(seed, naive_of(&rule), habit);
     report_seed(seed, &outcome);
 }
 
@@ -354,12 +346,12 @@ fn many_seeds_of_robots_that_behave_badly_keep_every_law() {
 
 #[test]
 fn each_naive_rule_breaks_its_law_beside_robots_that_behave_badly() {
-    crate::break_laws(ONE, &TWINS.map(|(rule, law, _)| (rule, law)));
+    break_laws(ONE, &TWINS.map(|(rule, law, _)| (rule, law)));
 }
 
 #[test]
 fn a_seed_of_robots_that_behave_badly_is_the_same_run_in_another_process() {
-    let (first, again) = (crate::elsewhere(ONE, 7, ""), crate::elsewhere(ONE, 7, ""));
+    let (first, again) = (elsewhere(ONE, 7, ""), elsewhere(ONE, 7, ""));
     let hash = hash_of(&first.0);
     assert!(hash.is_some() && hash == hash_of(&again.0), "{hash:?} {:?}", hash_of(&again.0));
 }

@@ -3,11 +3,11 @@
 //! Invariant: bodies, disks and the world of items outlive the processes that use them; everything else dies with its process. One
 //! thread, one time, one seed: the same plan gives the same run.
 
-use crate::agent::{Agent, machine};
+use crate::agent::Agent;
 use crate::client;
 use crate::clock::{MachineClock, Skew, TrueTime};
 use crate::disk::{ServerDisk, ServerFrames};
-use crate::net::{self, Ear, SERVER, SimDial, Wire};
+use crate::net::{self, Ear, SERVER, SimDial, Wire, machine};
 use crate::newer::Newer;
 use crate::observer::Shared;
 use crate::software::Software;

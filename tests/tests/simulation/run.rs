@@ -1,11 +1,10 @@
 //! One seed from its first fault to the end of every task, and what came of it.
 
-use crate::agent::machine;
 use crate::client::Wish;
 use crate::counted;
 use crate::disk::Mood;
 use crate::incidents;
-use crate::net::{SERVER, Way};
+use crate::net::{SERVER, Way, machine};
 use crate::orders::Order;
 use crate::plan::{Deed, Fault, Plan, ROBOTS};
 use crate::room::{CLIENT, Naive, Room, RoomConfig, site};

@@ -189,10 +189,10 @@ fn of_one_version(seed: u64, pair: Pair) -> BTreeSet<Code> {
 
 /// Plays a pair with each seed; `looks` at what came of it.
 fn each_seed(pair: Pair, looks: impl Fn(&Ended)) {
-    let seeds = crate::number("MIDSHIFT_SEEDS").unwrap_or(SEEDS);
-    let first = crate::number("MIDSHIFT_SEED_FROM").unwrap_or(1);
+    let seeds = crate::seeds::number("MIDSHIFT_SEEDS").unwrap_or(SEEDS);
+    let first = crate::seeds::number("MIDSHIFT_SEED_FROM").unwrap_or(1);
     for seed in first..first + seeds {
-        crate::say(&format!("{pair:?}: seed {seed}"));
+        crate::stderr::print_line(&format!("{pair:?}: seed {seed}"));
         let ended = Shift::open(seed, pair).play();
         let equal = of_one_version(seed, pair.equal());
         let more: Vec<_> = ended.incidents.difference(&equal).collect();

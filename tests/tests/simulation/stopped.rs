@@ -232,8 +232,8 @@ fn keeps_every_law(seed: u64) -> u64 {
 
 #[test]
 fn in_cuts_and_kills_nobody_moves_under_a_stop_and_after_them_everybody_knows_the_same_stops() {
-    let seeds = crate::number("MIDSHIFT_SEEDS").unwrap_or(SEEDS);
-    let first = crate::number("MIDSHIFT_SEED_FROM").unwrap_or(1);
+    let seeds = crate::seeds::number("MIDSHIFT_SEEDS").unwrap_or(SEEDS);
+    let first = crate::seeds::number("MIDSHIFT_SEED_FROM").unwrap_or(1);
     let lost: u64 = (first..first + seeds).map(keeps_every_law).sum();
     assert!(lost > 0, "no message was lost");
 }

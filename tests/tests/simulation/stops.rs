@@ -2,9 +2,8 @@
 //!
 //! Invariant: its folder outlives its process, and what a robot keeps of stops outlives the robot's; everything else dies with its process.
 
-use crate::agent::machine;
 use crate::clock::{MachineClock, Skew, TrueTime};
-use crate::net::{self, Ear, STOPS, SimDial, Way, Wire};
+use crate::net::{self, Ear, STOPS, SimDial, Way, Wire, machine};
 use crate::newer::Voice;
 use midshift_agent::stop::keep::MemoryStops;
 use midshift_agent::stop::line::StopLine;

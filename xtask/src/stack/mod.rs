@@ -5,38 +5,26 @@
 mod compose;
 mod plan;
 pub mod postgresql;
+pub mod site;
 mod state;
 mod supervise;
 
+use crate::run;
 use crate::workspace::Workspace;
-use crate::{docker, run};
 use anyhow::{Context, Result, bail, ensure};
 use clap::{Args, Subcommand};
 use plan::{Kind, Programs};
+use site::{PORTS, Site, submit_task};
 use state::State;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
-pub use supervise::send;
+pub use supervise::send_signal;
 
 /// The default file.
 const SPLIT: &str = "deploy/compose/split.yaml";
 const LOOK: Duration = Duration::from_millis(200);
-/// A task of the demo site.
-const TASK: [&str; 9] = ["task", "submit", "--from", "A01", "--to", "B03", "--sku", "SKU-1", "--wait"];
-/// Ports that the file publishes; a stack of a test has free ones.
-pub const PORTS: [&str; 5] = [
-    "MIDSHIFT_PUBLIC_PORT",
-    "MIDSHIFT_ROBOTS_PORT",
-    "MIDSHIFT_MACHINES_PORT",
-    "MIDSHIFT_STOP_PORT",
-    "MIDSHIFT_ONE_BOX_PORT",
-];
-/// What the first start left for whoever signs in, below the folder of volumes.
-const ROOT: &str = "site/ca.pem";
-const TOKEN: &str = "token/token";
-
 /// Which stack.
 #[derive(Args, Clone)]
 pub struct Which {
@@ -83,14 +71,13 @@ pub enum Verb {
     },
 }
 
-/// Runs one verb; whether it succeeded.
+/// Runs one verb with processes of this machine; whether it succeeded.
 pub fn run(workspace: &Workspace, verb: Verb) -> Result<bool> {
     match verb {
         Verb::Up { which, detach: false, binary } => up(workspace, &which, binary),
         Verb::Up { which, detach: true, binary } => detached(workspace, &which, binary),
         Verb::Down { which, volumes } => down(&which.folder(workspace)?, volumes),
-        Verb::Test { binary, docker: true, .. } => docker::test(workspace, &midshift(workspace, binary)?),
-        Verb::Test { which, binary, docker: false } => test(workspace, &which, binary),
+        Verb::Test { which, binary, .. } => test(workspace, &which, binary),
     }
 }
 
@@ -122,8 +109,8 @@ impl Which {
     }
 }
 
-/// The program of the suite, built if nobody names another.
-fn midshift(workspace: &Workspace, binary: Option<PathBuf>) -> Result<PathBuf> {
+/// The program that was named, or one that is built for it.
+pub fn midshift(workspace: &Workspace, binary: Option<PathBuf>) -> Result<PathBuf> {
     if let Some(binary) = binary {
         return std::fs::canonicalize(&binary).with_context(|| format!("no {}", binary.display()));
     }
@@ -161,11 +148,11 @@ fn up(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Result<b
     let public = public.context("no service has a port for people")?;
     let state = State::begin(&folder, public.clone())?;
     let site = Site::below(&folder);
-    run::say(&format!("{} processes, logs in {}", processes.len(), folder.display()));
+    run::print_line(&format!("{} processes, logs in {}", processes.len(), folder.display()));
     supervise::run(processes, state, || {
-        run::say(&format!("all are healthy; people and programs come in at {public}"));
+        run::print_line(&format!("all are healthy; people and programs come in at {public}"));
         let (root, token) = (site.root.display(), site.token.display());
-        run::say(&format!("next: midshift login {public} --ca {root} --token-file {token}"));
+        run::print_line(&format!("next: midshift login {public} --ca {root} --token-file {token}"));
     })
 }
 
@@ -202,11 +189,11 @@ fn detached(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Re
     loop {
         pause();
         if let Some(status) = child.try_wait().context("looking at the supervisor")? {
-            run::say(&std::fs::read_to_string(&log).unwrap_or_default());
+            run::print_line(&std::fs::read_to_string(&log).unwrap_or_default());
             bail!("it ended: {status}; see {}", folder.display());
         }
         if State::find(&folder).is_some_and(|state| state.ready) {
-            run::say(std::fs::read_to_string(&log).unwrap_or_default().trim_end());
+            run::print_line(std::fs::read_to_string(&log).unwrap_or_default().trim_end());
             return Ok(true);
         }
     }
@@ -215,14 +202,14 @@ fn detached(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Re
 fn down(folder: &Path, volumes: bool) -> Result<bool> {
     if let Some(state) = State::find(folder) {
         if state.supervisor.runs() {
-            supervise::send(state.supervisor.id, "TERM");
+            supervise::send_signal(state.supervisor.id, "TERM");
             while state.supervisor.runs() {
                 pause();
             }
         }
         // Left over by a supervisor that was killed.
         let left: Vec<_> = state.running().map(|(_, mark)| mark.clone()).collect();
-        left.iter().for_each(|mark| supervise::send(mark.id, "TERM"));
+        left.iter().for_each(|mark| supervise::send_signal(mark.id, "TERM"));
         while left.iter().any(state::Mark::runs) {
             pause();
         }
@@ -238,7 +225,7 @@ fn down(folder: &Path, volumes: bool) -> Result<bool> {
 pub fn test(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Result<bool> {
     let binary = midshift(workspace, binary)?;
     if let Some(state) = State::find(&which.folder(workspace)?) {
-        return task(workspace, &binary, &state.public, &Site::below(&state.folder));
+        return submit_task(workspace, &binary, &state.public, &Site::below(&state.folder));
     }
     let folder = std::env::temp_dir().join(format!("midshift-stack-test-{}", std::process::id()));
     let state = folder.display().to_string();
@@ -256,34 +243,11 @@ pub fn test(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Re
     }
     let done = run::succeeds(&mut start)?
         && State::find(&folder)
-            .is_some_and(|s| task(workspace, &binary, &s.public, &Site::below(&folder)).unwrap_or(false));
+            .is_some_and(|s| submit_task(workspace, &binary, &s.public, &Site::below(&folder)).unwrap_or(false));
     if !done {
-        run::say(&format!("logs are in {state}"));
+        run::print_line(&format!("logs are in {state}"));
         down(&folder, false)?;
         return Ok(false);
     }
     run::succeeds(&mut own(&["down", "--volumes"]))
-}
-
-/// What signs in to a stack: files with the site's root and its first token.
-pub struct Site {
-    /// PEM.
-    pub root: PathBuf,
-    /// May do everything.
-    pub token: PathBuf,
-}
-
-impl Site {
-    /// Of a stack with its state in `folder`.
-    fn below(folder: &Path) -> Self {
-        let volumes = folder.join("volumes");
-        Self { root: volumes.join(ROOT), token: volumes.join(TOKEN) }
-    }
-}
-
-/// One task through the public address, to its end.
-pub fn task(workspace: &Workspace, midshift: &Path, public: &str, site: &Site) -> Result<bool> {
-    let mut command = workspace.command(midshift);
-    command.args(TASK).args(["--server", public, "--ca"]).arg(&site.root).arg("--token-file").arg(&site.token);
-    run::succeeds(&mut command)
 }

@@ -12,9 +12,9 @@ use std::time::Duration;
 /// Where the programs of services are.
 #[derive(Clone, Debug)]
 pub struct Programs {
-    /// midshift.
+    /// The program midshift.
     pub midshift: PathBuf,
-    /// HAProxy.
+    /// The program HAProxy.
     pub haproxy: PathBuf,
     /// The folder with PostgreSQL's server programs.
     pub postgresql: PathBuf,
@@ -239,7 +239,7 @@ mod tests {
             variables_of(&std::fs::read_to_string(root.join("deploy/compose/.env.example")).unwrap());
         // Whatever else runs on this machine.
         let free = || TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port().to_string();
-        for port in crate::stack::PORTS {
+        for port in crate::stack::site::PORTS {
             variables.insert(port.to_owned(), free());
         }
         let services = read(&std::fs::read_to_string(&file).unwrap(), &variables).unwrap();

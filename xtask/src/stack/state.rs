@@ -17,7 +17,7 @@ pub struct Mark {
 
 impl Mark {
     /// Of a process that runs now.
-    pub fn of(id: u32) -> Self {
+    pub fn new(id: u32) -> Self {
         Self { id, started: started(id) }
     }
     /// Whether it still runs, and is the same.
@@ -59,7 +59,7 @@ pub struct State {
 impl State {
     /// Of a stack that begins in this process.
     pub fn begin(folder: &Path, public: String) -> Result<Self> {
-        let supervisor = Mark::of(std::process::id());
+        let supervisor = Mark::new(std::process::id());
         let state = Self { folder: folder.to_owned(), public, ready: false, supervisor, processes: BTreeMap::new() };
         state.write()?;
         Ok(state)
@@ -119,7 +119,7 @@ mod tests {
     #[test]
     fn a_process_is_known_until_it_ends_and_a_later_one_of_its_id_is_another() {
         let mut child = std::process::Command::new("sleep").arg("60").spawn().unwrap();
-        let mark = Mark::of(child.id());
+        let mark = Mark::new(child.id());
         assert!(mark.runs() && Mark::read(&mark.json()) == Some(mark.clone()));
         assert!(!Mark { started: Some("1".to_owned()), ..mark.clone() }.runs());
         child.kill().unwrap();

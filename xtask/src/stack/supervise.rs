@@ -51,7 +51,7 @@ pub fn run(processes: Vec<Process>, mut state: State, ready: impl FnOnce()) -> R
                 _ = terminate.recv() => break Ok(()),
                 _ = looks.tick() => {}
             }
-            if let Err(error) = look(&mut held, &mut state) {
+            if let Err(error) = mend_stack(&mut held, &mut state) {
                 break Err(error);
             }
             if ready.is_some() && held.iter().all(|h| h.healthy) {
@@ -61,7 +61,7 @@ pub fn run(processes: Vec<Process>, mut state: State, ready: impl FnOnce()) -> R
             }
             if ready.is_some() && now.elapsed() > HEALTHY_WITHIN {
                 let late: Vec<_> = held.iter().filter(|h| !h.healthy).map(|h| h.process.name.as_str()).collect();
-                run::say(&format!("not healthy within {HEALTHY_WITHIN:?}: {}", late.join(", ")));
+                run::print_line(&format!("not healthy within {HEALTHY_WITHIN:?}: {}", late.join(", ")));
                 break Ok(());
             }
         };
@@ -72,7 +72,7 @@ pub fn run(processes: Vec<Process>, mut state: State, ready: impl FnOnce()) -> R
 }
 
 /// One look at all of them.
-fn look(held: &mut [Held], state: &mut State) -> Result<()> {
+fn mend_stack(held: &mut [Held], state: &mut State) -> Result<()> {
     let healthy: Vec<String> = held.iter().filter(|h| h.healthy).map(|h| h.process.name.clone()).collect();
     for one in held.iter_mut() {
         if let Some(child) = &mut one.child
@@ -82,7 +82,7 @@ fn look(held: &mut [Held], state: &mut State) -> Result<()> {
                 (one.child, one.healthy) = (None, true);
                 continue;
             }
-            run::say(&format!("{} ended: {status}; it is started again", one.process.name));
+            run::print_line(&format!("{} ended: {status}; it is started again", one.process.name));
             (one.child, one.healthy, one.next) = (None, false, Instant::now() + AGAIN);
         }
         // What has done its work is not done again.
@@ -93,7 +93,7 @@ fn look(held: &mut [Held], state: &mut State) -> Result<()> {
             // Only the first start waits for others: later they are there, or come back by themselves.
             if one.process.depends_on.iter().all(|on| healthy.contains(on)) || state.has(&one.process.name) {
                 let child = start(&one.process, &state.folder)?;
-                state.add(&one.process.name, Mark::of(child.id()))?;
+                state.add(&one.process.name, Mark::new(child.id()))?;
                 one.child = Some(child);
                 one.next = Instant::now() + ASK;
             }
@@ -148,7 +148,7 @@ async fn end(held: &mut [Held], looks: &mut tokio::time::Interval) {
         }
         for one in &mut now {
             if let Some(child) = &one.child {
-                send(child.id(), &one.process.stop_signal);
+                send_signal(child.id(), &one.process.stop_signal);
             }
             one.next = Instant::now() + one.process.grace;
         }
@@ -158,8 +158,8 @@ async fn end(held: &mut [Held], looks: &mut tokio::time::Interval) {
                 let Some(child) = &mut one.child else { continue };
                 let ended = child.try_wait().is_ok_and(|status| status.is_some());
                 if !ended && Instant::now() > one.next {
-                    run::say(&format!("{} did not end by itself", one.process.name));
-                    send(child.id(), "KILL");
+                    run::print_line(&format!("{} did not end by itself", one.process.name));
+                    send_signal(child.id(), "KILL");
                     let _ = child.wait();
                     one.child = None;
                 } else if ended {
@@ -171,7 +171,7 @@ async fn end(held: &mut [Held], looks: &mut tokio::time::Interval) {
 }
 
 /// Sends a signal by its name; a process that is gone is no error.
-pub fn send(id: u32, name: &str) {
+pub fn send_signal(id: u32, name: &str) {
     let signal = match name {
         "INT" => Signal::INT,
         "QUIT" => Signal::QUIT,

@@ -3,7 +3,8 @@
 use super::hall::{Floor, GROUPS, attached};
 use super::rollouts::{Rollouts, spec};
 use crate::child::Child;
-use crate::ota::{OtaArgs, release};
+use crate::ota::args::OtaArgs;
+use crate::ota::release;
 use anyhow::ensure;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::fleet::v1::{AreaPolicy, PutAreaPolicyRequest, SoftwareRules};
@@ -51,7 +52,7 @@ pub async fn measure(args: &OtaArgs) -> anyhow::Result<WentBack> {
     let areas: BTreeSet<String> = floor.areas();
     no_budget(&server, &areas).await?;
     let _swarm = floor.swarm(robots)?;
-    let mut rollouts = Rollouts::of(&server).await?;
+    let mut rollouts = Rollouts::connect(&server).await?;
     attached(&mut server, &mut rollouts, robots).await?;
     let all = [Size::Rest(true)];
     let kept = versions(&mut rollouts).await?;

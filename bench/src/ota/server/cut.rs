@@ -3,7 +3,7 @@
 use super::assign::{ID, OFFERED_WITHIN, spec_of, until_offered};
 use super::hall::{Floor, attached};
 use super::rollouts::Rollouts;
-use crate::ota::OtaArgs;
+use crate::ota::args::OtaArgs;
 use anyhow::ensure;
 use std::time::Duration;
 use tokio::time::{Instant, sleep};
@@ -37,7 +37,7 @@ pub async fn measure(args: &OtaArgs, robots: usize) -> anyhow::Result<Option<Cut
     let mut server = floor.serve().await?;
     floor.people.push(&server).await?;
     let mut robots_child = floor.hearers(robots, None)?;
-    let mut rollouts = Rollouts::of(&server).await?;
+    let mut rollouts = Rollouts::connect(&server).await?;
     attached(&mut server, &mut rollouts, robots).await?;
     rollouts.create(ID, spec_of(args.server.canary, robots)).await?;
     rollouts.submit_and_approve(ID).await?;
@@ -66,7 +66,7 @@ pub async fn measure(args: &OtaArgs, robots: usize) -> anyhow::Result<Option<Cut
     if before == robots {
         return Ok(None);
     }
-    let mut rollouts = Rollouts::of(&server).await?;
+    let mut rollouts = Rollouts::connect(&server).await?;
     let assigned = |left: u32| robots - left as usize;
     let more = |r: &midshift_proto::ota::v1::Rollout| r.counts.is_some_and(|c| assigned(c.waiting) > before);
     rollouts.until(ID, ASK_EVERY, OFFERED_WITHIN, more).await?;

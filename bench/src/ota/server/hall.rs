@@ -43,7 +43,7 @@ impl Floor {
     /// For so many robots, below `dir` or the temporary directory.
     pub fn make(dir: Option<&PathBuf>, robots: usize) -> anyhow::Result<Self> {
         let dir = place(dir)?;
-        let map = crate::hall::map(dir.path(), (robots as f64).sqrt() as usize + 2)?;
+        let map = crate::grid_map::write(dir.path(), (robots as f64).sqrt() as usize + 2)?;
         let site = midshift_cli::site_file::load(Some(&map), None, None)?.site;
         let people = People::make(dir.path())?;
         // A server that is started again listens where its robots look for it.

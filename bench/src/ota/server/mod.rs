@@ -11,7 +11,7 @@ mod rollouts;
 mod sign;
 mod trace;
 
-use super::OtaArgs;
+use super::args::OtaArgs;
 use crate::figure::{Figure, median};
 use crate::fsync::Disk;
 use crate::fsync::place;
@@ -22,26 +22,6 @@ use cut::Cut;
 
 /// Appends to the disk in each round, for the figures that end with a commit.
 const APPENDS: usize = 200;
-
-/// What to measure of the server.
-#[derive(Clone, Debug, clap::Args)]
-pub struct ServerArgs {
-    /// Robots that are assigned a roll-out. Without it 10,000, or as many as the limit of open files allows. 0: none is assigned.
-    #[arg(long)]
-    robots: Option<usize>,
-    /// Robots of its first wave, at most a tenth of all.
-    #[arg(long, default_value_t = 100)]
-    canary: u32,
-    /// Seconds before each start in which what idle robots cost is measured.
-    #[arg(long, default_value_t = 10)]
-    idle_seconds: u64,
-    /// Simulated robots that go back from a release. 0: none does.
-    #[arg(long, default_value_t = 100)]
-    back_robots: usize,
-    /// Directives signed in each round.
-    #[arg(long, default_value_t = 5_000)]
-    directives: usize,
-}
 
 /// Runs rounds of everything and the disk, in turn.
 pub async fn run(args: &OtaArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> {
@@ -100,7 +80,7 @@ fn of_assigned(robots: usize, do_what: &str, runs: &[Assigned], syncs_ms: &[f64]
     let sync_s = ("fdatasync of 4 KiB, p50", each(syncs_ms, |ms| ms / 1e3));
     let mut figures = Vec::new();
     let mut add = |what: &str, values: Vec<f64>, (limit, of_limit): (&str, Vec<f64>)| {
-        figures.push(Figure::of("P9", name(what), "s", &values, Some((limit, &of_limit))));
+        figures.push(Figure::new("P9", name(what), "s", &values, Some((limit, &of_limit))));
     };
     add(
         "CPU of create, submit, approve",
@@ -118,7 +98,7 @@ fn of_assigned(robots: usize, do_what: &str, runs: &[Assigned], syncs_ms: &[f64]
     add("CPU to all, beyond that of idle robots", beyond, signed);
     let cores = ("the same robots, no roll-out", each(runs, |r| r.idle_cores));
     let after = each(runs, |r| r.after_cores);
-    figures.push(Figure::of("P9", name("server while they fetch"), "cores", &after, Some((cores.0, &cores.1))));
+    figures.push(Figure::new("P9", name("server while they fetch"), "cores", &after, Some((cores.0, &cores.1))));
     figures
 }
 
@@ -132,9 +112,9 @@ fn of_cuts(robots: usize, cuts: &[Cut], whole: &[Assigned]) -> Vec<Figure> {
     let all_cpu = ("undisturbed: CPU to all offered", each(whole, |r| r.all_cpu_s));
     let count = vec![robots as f64; whole.len()];
     let mut figures =
-        vec![Figure::of("P9", name("assigned by then"), "robots", &each(cuts, |c| c.before), Some(("all", &count)))];
+        vec![Figure::new("P9", name("assigned by then"), "robots", &each(cuts, |c| c.before), Some(("all", &count)))];
     let mut add = |what: &str, values: Vec<f64>, limit: &(&str, Vec<f64>)| {
-        figures.push(Figure::of("P9", name(what), "s", &values, Some((limit.0, &limit.1))));
+        figures.push(Figure::new("P9", name(what), "s", &values, Some((limit.0, &limit.1))));
     };
     add("start to ready", each(cuts, |c| c.ready_s), &first);
     add("ready to first new assignment", each(cuts, |c| c.first_s), &first);
@@ -154,8 +134,8 @@ fn of_ways(robots: usize, ways: &[WentBack], syncs_ms: &[f64]) -> Vec<Figure> {
         let (took, half) = (each(ways, |w| way(w).all_s), each(ways, |w| way(w).half_s));
         let disk = Some(("an fdatasync for each group commit", disk.as_slice()));
         [
-            Figure::of("P9", name(&format!("{what}, half of them")), "s", &half, disk),
-            Figure::of("P9", name(&format!("{what}, all")), "s", &took, disk),
+            Figure::new("P9", name(&format!("{what}, half of them")), "s", &half, disk),
+            Figure::new("P9", name(&format!("{what}, all")), "s", &took, disk),
         ]
     };
     let mut figures = Vec::from(of(|w| &w.on_trial, "abort to kept version, on trial"));

@@ -41,7 +41,7 @@ pub fn spec(bundle: String, sizes: &[Size], soak_ms: u64) -> v1::RolloutSpec {
 
 impl Rollouts {
     /// Over a connection of its own.
-    pub async fn of(server: &Child) -> anyhow::Result<Self> {
+    pub async fn connect(server: &Child) -> anyhow::Result<Self> {
         Ok(Self(RolloutServiceClient::new(server.channel().await?)))
     }
     /// Writes one down, once the server knows its bundle.

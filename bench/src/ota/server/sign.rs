@@ -34,7 +34,7 @@ pub fn run(directives: usize, rounds: usize) -> anyhow::Result<Vec<Figure>> {
         }));
     }
     let limit = format!("bare ed25519 of the same {} bytes", bytes.len());
-    Ok(vec![Figure::of("P9", "directives built, signed and encoded", "1/s", &whole, Some((&limit, &bare)))])
+    Ok(vec![Figure::new("P9", "directives built, signed and encoded", "1/s", &whole, Some((&limit, &bare)))])
 }
 
 /// What is signed of a directive: its payload, behind what DSSE puts before it.

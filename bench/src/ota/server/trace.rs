@@ -17,7 +17,7 @@ pub struct Trace {
 
 impl Trace {
     /// Of the process with this number, as long as it lives.
-    pub fn of(pid: u32) -> Self {
+    pub fn begin(pid: u32) -> Self {
         let seen = Arc::new(Mutex::new(Vec::new()));
         let mut looks = JoinSet::new();
         let kept = seen.clone();

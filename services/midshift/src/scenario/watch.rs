@@ -3,7 +3,6 @@
 //! Invariant: what robots say is taken before the rows that follow from it are judged; rows that could not be read are an objection.
 //! Called by the story, once, and asked for each of its roll-outs.
 
-use super::LOOK_EVERY;
 use super::budget::{Judge, Pace, Said, Seen};
 use midshift_core::fleet::rows::Drain;
 use midshift_core::ids::{AreaId, RobotId};
@@ -20,6 +19,9 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use tokio_util::task::AbortOnDropHandle;
+
+/// How often robots and roll-outs are looked at, real time.
+pub(super) const LOOK_EVERY: Duration = Duration::from_millis(200);
 
 /// All rows of a roll-out must be read so long after its end, real time.
 const READ_WITHIN: Duration = Duration::from_secs(30);

@@ -3,12 +3,12 @@
 //! Invariant: only one that answered nothing three times is ended, the process that holds the folder, once in 30 s; beyond that a person is told.
 //! What it says goes to a file of its own: it must not depend on where the server's own words go.
 
-use super::FOLDER;
 use super::program::{LOOK_EVERY, UP_WITHIN, program};
 use crate::clock;
 use anyhow::{Context, bail};
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_agent::tls::{self, Tls};
+use midshift_cli::stop_service::FOLDER;
 use midshift_core::limits;
 use midshift_core::maintenance::INCIDENT;
 use midshift_core::reason::{Code, Reason};

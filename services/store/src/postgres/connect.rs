@@ -12,6 +12,10 @@ use std::str::FromStr;
 use std::sync::Arc;
 use std::time::Duration;
 
+/// Schema of what the services write as rows.
+pub(super) const CONTROL_SCHEMA: &str = "control";
+/// Schema of samples.
+pub(super) const TELEMETRY_SCHEMA: &str = "telemetry";
 /// Oldest server that is tried out, as `server_version_num`.
 const VERSION_MIN: u32 = 150_000;
 /// A writer waits for the site's head at most so long, ms; its callers hear `Unavailable` and try again.
@@ -295,6 +299,11 @@ async fn setting(connection: &mut PgConnection, name: &'static str) -> Result<St
 /// What a read answers, or that the server has not answered in time.
 pub(super) async fn patiently<T>(reading: impl Future<Output = Result<T, Error>>) -> Result<T, Error> {
     tokio::time::timeout(READ_PATIENCE, reading).await.unwrap_or_else(|_| Err(Error::Unavailable(no_answer())))
+}
+
+/// Serialization failure and deadlock: the server says that it wrote nothing, also when it says so at COMMIT.
+pub(super) fn is_undone_by_others(error: &sqlx::Error) -> bool {
+    error.as_database_error().and_then(|e| e.code()).is_some_and(|code| code == "40001" || code == "40P01")
 }
 
 /// The connection is no more: what was open on it is rolled back, and nothing can be said on it again. Classes 08 and 57P0x are the server's own words for it.

@@ -2,9 +2,9 @@
 //!
 //! Invariant: as [`FrameLog`]. Positions rise in the order of commits over all processes, so that a reader passes nothing over.
 
-use super::connect::{Database, PostgresConfig, patiently};
+use super::connect::{Database, PostgresConfig, TELEMETRY_SCHEMA, patiently};
 use super::frames_writer::FramesWriter;
-use super::{TELEMETRY_SCHEMA, migrate, read};
+use super::{migrate, read};
 use crate::frames::{GAPS_MAX, frames_well_formed, gaps_well_formed};
 use crate::frames_queue::{Command, FramesQueue, READ_ROWS, gap, page_end, run, stored};
 use crate::migrations::TELEMETRY;

@@ -3,8 +3,7 @@
 //! Invariant: `frame_head.marked_position` is the newest position of all processes, and `frame_mark` is written with the frames:
 //! a robot may go on at another gateway, which must know at once how far it has come.
 
-use super::connect::{Database, WRITE_PATIENCE, is_gone, no_answer};
-use super::writer::is_undone_by_others;
+use super::connect::{Database, WRITE_PATIENCE, is_gone, is_undone_by_others, no_answer};
 use crate::frames::Marks;
 use crate::frames_queue::{COARSE_ROWS, FramesEngine, GAPS_KEPT, Packed, made_coarser, mark, surplus};
 use crate::queue::unavailable;
@@ -56,7 +55,7 @@ impl FramesWriter {
         Ok(Self { database, connection: Some(connection), site_id, clock, bytes_max })
     }
 
-    async fn take(&mut self) -> Result<PgConnection, Error> {
+    async fn connect(&mut self) -> Result<PgConnection, Error> {
         match self.connection.take() {
             Some(connection) => Ok(connection),
             None => self.database.writer().await.map_err(|e| Error::Unavailable(Arc::new(e))),
@@ -69,7 +68,7 @@ impl FramesWriter {
         loop {
             attempt += 1;
             let is_kept = self.connection.is_some();
-            let mut connection = self.take().await?;
+            let mut connection = self.connect().await?;
             let done = tokio::time::timeout(WRITE_PATIENCE, once(&mut connection, &self.site_id, work)).await;
             match done.map_err(|_| Error::Unavailable(no_answer()))? {
                 Ok(freed) => {
@@ -99,7 +98,7 @@ impl FramesEngine for FramesWriter {
     }
 
     async fn marks(&mut self) -> Result<Vec<FrameMark>, Error> {
-        let mut connection = self.take().await?;
+        let mut connection = self.connect().await?;
         let select = sqlx::query(sql::FRAME_MARKS).bind(self.site_id.as_str()).fetch_all(&mut connection);
         let rows = tokio::time::timeout(WRITE_PATIENCE, select).await;
         let rows = rows.map_err(|_| Error::Unavailable(no_answer()))?.map_err(unavailable)?;
@@ -126,7 +125,7 @@ impl FramesEngine for FramesWriter {
     }
 
     async fn oldest(&mut self) -> Result<FramesOldest, Error> {
-        let mut connection = self.take().await?;
+        let mut connection = self.connect().await?;
         let read = tokio::time::timeout(WRITE_PATIENCE, oldest(&mut connection, &self.site_id)).await;
         let oldest = read.map_err(|_| Error::Unavailable(no_answer()))?.map_err(unavailable)?;
         self.connection = Some(connection);

@@ -4,10 +4,11 @@
 //! robot's silence locks the store's head first and that row after it ([`broken_silence`]). So of the two one sees the other, and
 //! they never wait for each other in a circle.
 
-use super::connect::{Database, PostgresConfig, WRITE_PATIENCE, no_answer, patiently};
+use super::connect::{
+    CONTROL_SCHEMA, Database, PostgresConfig, WRITE_PATIENCE, is_undone_by_others, no_answer, patiently,
+};
 use super::migrate::BEGIN;
 use super::read;
-use super::writer::is_undone_by_others;
 use crate::queue::unavailable;
 use crate::{Error, Heard, HeardLog, Kept, OpenError};
 use async_trait::async_trait;
@@ -38,7 +39,7 @@ impl PostgresHeard {
     /// If the database cannot be reached.
     pub fn open(config: &PostgresConfig, site_id: SiteId) -> Boxed<'_, Result<Self, OpenError>> {
         Box::pin(async move {
-            let database = Database::new(config, super::CONTROL_SCHEMA)?;
+            let database = Database::new(config, CONTROL_SCHEMA)?;
             let mut connection = database.writer().await?;
             sqlx::query(
                 "INSERT INTO robot_last_head (site_id, position) VALUES ($1, 0) ON CONFLICT (site_id) DO NOTHING",
@@ -71,7 +72,7 @@ impl HeardLog for PostgresHeard {
                 Some(connection) => connection,
                 None => self.database.writer().await.map_err(|error| Error::Unavailable(Arc::new(error)))?,
             };
-            let done = tokio::time::timeout(WRITE_PATIENCE, keep(&mut connection, &self.site_id, &heard)).await;
+            let done = tokio::time::timeout(WRITE_PATIENCE, keep_batch(&mut connection, &self.site_id, &heard)).await;
             match done.map_err(|_| Error::Unavailable(no_answer()))? {
                 Ok(kept) => {
                     *writer = Some(connection);
@@ -122,7 +123,7 @@ fn robot_id(text: &str) -> Result<RobotId, sqlx::Error> {
     RobotId::parse(text).map_err(|error| sqlx::Error::Decode(Box::new(error)))
 }
 
-async fn keep(connection: &mut PgConnection, site_id: &SiteId, heard: &[Heard]) -> Result<Kept, sqlx::Error> {
+async fn keep_batch(connection: &mut PgConnection, site_id: &SiteId, heard: &[Heard]) -> Result<Kept, sqlx::Error> {
     sqlx::raw_sql(BEGIN).execute(&mut *connection).await?;
     let moved = sqlx::query("UPDATE robot_last_head SET position = position + 1 WHERE site_id = $1 RETURNING position")
         .bind(site_id.as_str())

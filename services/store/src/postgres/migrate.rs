@@ -38,7 +38,7 @@ pub(super) async fn apply(
     climb(&mut transaction, from, pending).await.map_err(sql)?;
     if let Some((site_id, created)) = store {
         // Under the lock, so that two sites cannot both be the first one.
-        super::writer::identify(&mut transaction, site_id, created).await?;
+        super::identity::identify(&mut transaction, site_id, created).await?;
     }
     transaction.commit().await.map_err(sql)?;
     drop(connection.close().await);

@@ -10,6 +10,7 @@ mod connect;
 mod frames;
 mod frames_writer;
 mod heard;
+mod identity;
 mod migrate;
 mod read;
 mod wake;
@@ -27,7 +28,7 @@ use crate::{
     Applied, CommitError, Error, FeedPage, GET_KEYS_MAX, OpenError, Query, Retention, Snapshot, Store, StoreId,
 };
 use async_trait::async_trait;
-use connect::{Database, patiently};
+use connect::{CONTROL_SCHEMA, Database, TELEMETRY_SCHEMA, patiently};
 use midshift_core::Boxed;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
@@ -39,9 +40,6 @@ use std::sync::Arc;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use writer::Writer;
-
-const CONTROL_SCHEMA: &str = "control";
-const TELEMETRY_SCHEMA: &str = "telemetry";
 
 /// Brings both schemas of a database up to this binary's; creates what is not there.
 ///
@@ -80,7 +78,7 @@ impl PostgresStore {
             if !migrated.applied.is_empty() {
                 tracing::info!(schema = migrated.file, from = migrated.from, to = migrated.to, "schema migrated");
             }
-            let id = writer::identify(&mut connection, &site_id, clock.now().wall).await?;
+            let id = identity::identify(&mut connection, &site_id, clock.now().wall).await?;
             let head = read::head(&mut connection, &site_id)
                 .await
                 .map_err(|source| OpenError::Sql { doing: "reading the head", source })?;

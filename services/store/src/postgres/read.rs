@@ -8,7 +8,8 @@ use crate::audit::{self, Heads};
 use crate::gather::Gathered;
 use crate::queue::unavailable;
 use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
-use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Snapshot, page_of};
+use crate::store::page_of;
+use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Snapshot};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Naming, Part, Row, Seq, Table};
 use sqlx::postgres::PgRow;
@@ -116,7 +117,7 @@ pub(super) async fn read(
             Part::Rows(_) | Part::OfParents { .. } => continue,
         };
         for select in selects {
-            gathered.take(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
+            gathered.add(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
         }
     }
     loop {
@@ -124,7 +125,7 @@ pub(super) async fn read(
         let is_whole = parents.is_empty();
         for (table, parent) in parents {
             let select = sqlx::query(AssertSqlSafe(sql::of_parent(table))).bind(site_id.as_str()).bind(&*parent);
-            gathered.take(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
+            gathered.add(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
         }
         let missing = gathered.missing();
         if missing.is_empty() && is_whole {
@@ -134,7 +135,7 @@ pub(super) async fn read(
             for ids in ids.chunks(GET_KEYS_MAX) {
                 let ids: Vec<&str> = ids.iter().map(|id| &**id).filter(|id| is_text(id)).collect();
                 let select = sqlx::query(AssertSqlSafe(by_ids(table))).bind(site_id.as_str()).bind(ids);
-                gathered.take(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
+                gathered.add(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
             }
         }
     }

@@ -56,7 +56,7 @@ pub(super) async fn listen(database: Database, site_id: SiteId, wake: watch::Sen
     let channel = channel(&site_id);
     loop {
         match database.listener(&channel).await {
-            Ok(listener) => hear(listener, &wake).await,
+            Ok(listener) => raise_heard(listener, &wake).await,
             Err(error) => tracing::warn!(%error, "listening for commits failed; looking for them instead"),
         }
         tokio::time::sleep(RECONNECT_PAUSE).await;
@@ -64,7 +64,7 @@ pub(super) async fn listen(database: Database, site_id: SiteId, wake: watch::Sen
 }
 
 /// Until the connection is lost.
-async fn hear(mut listener: PgListener, wake: &watch::Sender<Seq>) {
+async fn raise_heard(mut listener: PgListener, wake: &watch::Sender<Seq>) {
     while let Ok(Some(heard)) = listener.try_recv().await {
         if let Ok(seq) = heard.payload().parse() {
             raise(wake, Seq(seq));

@@ -4,17 +4,18 @@
 //! go at COMMIT. So number order is commit order over all processes, and what an item expects or keeps is still so when it is
 //! committed. Nothing is remembered from one transaction to the next: other processes write too.
 
-use super::connect::{Database, WRITE_PATIENCE, is_gone, no_answer};
+use super::connect::{Database, WRITE_PATIENCE, is_gone, is_undone_by_others, no_answer};
 use super::heard::broken_silence;
+use super::identity::identify;
 use super::write_sql;
 use crate::audit::Heads;
 use crate::group::Group;
 use crate::queue::{Engine, Failed, Results};
-use crate::{Cause, CommitError, Error, OpenError, StoreId, sql};
+use crate::{Cause, CommitError, Error, StoreId};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Item, Log, Seq, Silent};
-use midshift_core::time::{Clock, Utc};
-use sqlx::{Connection, PgConnection, Row};
+use midshift_core::time::Clock;
+use sqlx::{Connection, PgConnection};
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::watch;
@@ -57,11 +58,6 @@ impl From<sqlx::Error> for Undone {
             error => Self::Before(Arc::new(error)),
         }
     }
-}
-
-/// Serialization failure and deadlock: the server says that it wrote nothing, also when it says so at COMMIT.
-pub(super) fn is_undone_by_others(error: &sqlx::Error) -> bool {
-    error.as_database_error().and_then(|e| e.code()).is_some_and(|code| code == "40001" || code == "40P01")
 }
 
 impl Writer {
@@ -270,29 +266,4 @@ impl Engine for Writer {
 fn error(failed: Failed) -> Error {
     let (Failed::Before(cause) | Failed::AtCommit(cause)) = failed;
     Error::Unavailable(cause)
-}
-
-/// Reads the store's identity, or makes one: a new store gets a random id and numbers from `created` on.
-pub(super) async fn identify(
-    connection: &mut PgConnection,
-    site_id: &SiteId,
-    created: Utc,
-) -> Result<StoreId, OpenError> {
-    let failed = |source| OpenError::Sql { doing: "reading the store's identity", source };
-    if sqlx::query(sql::IDENTITY).fetch_optional(&mut *connection).await.map_err(failed)?.is_none() {
-        sqlx::query(sql::IDENTIFY)
-            .bind(site_id.as_str())
-            .bind(crate::sql::fresh_id())
-            .bind(created.0.max(0))
-            .execute(&mut *connection)
-            .await
-            .map_err(failed)?;
-    }
-    let row = sqlx::query(sql::IDENTITY).fetch_one(connection).await.map_err(failed)?;
-    let found: String = row.try_get(0).map_err(failed)?;
-    if found != site_id.as_str() {
-        return Err(OpenError::OtherSite { found, asked: site_id.clone() });
-    }
-    let store_id: String = row.try_get(1).map_err(failed)?;
-    Ok(StoreId(Arc::from(store_id)))
 }

@@ -3,11 +3,12 @@
 //! Invariant: a copy is one moment of its file, whole and durable, or it is not there. A store that was restored is another store: it gets an
 //! id of its own, so that nobody goes on from a number that the copy never gave.
 
-use super::{CONTROL_DB, OpenError, TELEMETRY_DB, schema, write_sql};
-use crate::StoreId;
+use super::file::{CONTROL_DB, TELEMETRY_DB};
+use super::{schema, write_sql};
 use crate::amend::amended;
 use crate::migrations::{self, Migration};
 use crate::sql::{self, RENEW};
+use crate::{OpenError, StoreId};
 use midshift_core::Boxed;
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Item, Row as StoredRow, Seq, Table};

@@ -14,6 +14,10 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::oneshot;
 
+/// File of what the services write as rows.
+pub(super) const CONTROL_DB: &str = "control.db";
+/// File of samples.
+pub(super) const TELEMETRY_DB: &str = "telemetry.db";
 /// A file that ended a moment ago may hold its lock for a little longer than its owner.
 const LOCK_ATTEMPTS: u32 = 25;
 const LOCK_PAUSE: Duration = Duration::from_millis(20);

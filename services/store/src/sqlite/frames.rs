@@ -2,8 +2,7 @@
 //!
 //! Invariant: as [`FrameLog`]. A row holds many frames, because a row per sample costs more than the sample.
 
-use super::TELEMETRY_DB;
-use super::file::DataFile;
+use super::file::{DataFile, TELEMETRY_DB};
 use super::frames_writer::FramesWriter;
 use crate::frames::{GAPS_MAX, frames_well_formed, gaps_well_formed};
 use crate::frames_queue::{Command, FramesQueue, READ_ROWS, gap, page_end, run, stored};

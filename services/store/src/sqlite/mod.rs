@@ -24,7 +24,7 @@ use crate::{
     Applied, CommitError, Error, FeedPage, GET_KEYS_MAX, OpenError, Query, Retention, Snapshot, Store, StoreId,
 };
 use async_trait::async_trait;
-use file::DataFile;
+use file::{CONTROL_DB, DataFile, TELEMETRY_DB};
 use midshift_core::Boxed;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
@@ -37,9 +37,6 @@ use std::sync::Arc;
 use tail::Tail;
 use tokio::sync::{oneshot, watch};
 use writer::Writer;
-
-const CONTROL_DB: &str = "control.db";
-const TELEMETRY_DB: &str = "telemetry.db";
 
 /// Brings both files of a data directory up to this binary's schema; creates what is not there.
 ///

@@ -8,7 +8,8 @@ use crate::audit::{self, Heads};
 use crate::gather::Gathered;
 use crate::queue::unavailable;
 use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
-use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot, page_of};
+use crate::store::page_of;
+use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Naming, Part, Row, Seq, Table};
 use sqlx::sqlite::{SqliteArguments, SqliteRow};
@@ -38,12 +39,12 @@ pub(super) async fn get(readers: &SqlitePool, site_id: &SiteId, keys: &[Key]) ->
     if let [(table, ids)] = slices[..] {
         // One statement needs no transaction to be of one moment.
         let rows = select(site_id, table, ids).fetch_all(readers).await?;
-        take(&mut found, table, &rows)?;
+        add_rows(&mut found, table, &rows)?;
     } else {
         let mut transaction = readers.begin().await?;
         for (table, ids) in slices {
             let rows = select(site_id, table, ids).fetch_all(&mut *transaction).await?;
-            take(&mut found, table, &rows)?;
+            add_rows(&mut found, table, &rows)?;
         }
     }
     Ok(keys.iter().filter_map(|key| found.get(key).cloned()).collect())
@@ -55,7 +56,7 @@ fn select<'q>(site_id: &'q SiteId, table: Table, ids: &[&Arc<str>]) -> Statement
     ids.iter().fold(prepared(sql).bind(site_id.as_str()), |select, id| select.bind(Arc::clone(id)))
 }
 
-fn take(found: &mut BTreeMap<Key, Row>, table: Table, rows: &[SqliteRow]) -> Result<(), sqlx::Error> {
+fn add_rows(found: &mut BTreeMap<Key, Row>, table: Table, rows: &[SqliteRow]) -> Result<(), sqlx::Error> {
     for one in rows {
         let one = row(table, one)?;
         found.insert(one.key.clone(), one);
@@ -123,7 +124,7 @@ pub(super) async fn read(
             Part::Rows(_) | Part::OfParents { .. } => continue,
         };
         for select in selects {
-            gathered.take(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
+            gathered.add(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
         }
     }
     loop {
@@ -131,7 +132,7 @@ pub(super) async fn read(
         let is_whole = parents.is_empty();
         for (table, parent) in parents {
             let select = prepared(sql::of_parent(table)).bind(site_id.as_str()).bind(parent);
-            gathered.take(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
+            gathered.add(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
         }
         let missing = gathered.missing();
         if missing.is_empty() && is_whole {
@@ -141,7 +142,7 @@ pub(super) async fn read(
             for ids in ids.chunks(IDS_PER_STATEMENT) {
                 let ids: Vec<&Arc<str>> = ids.iter().collect();
                 let rows = select(site_id, table, &ids).fetch_all(&mut *transaction).await?;
-                gathered.take(rows_of(table, &rows)?);
+                gathered.add(rows_of(table, &rows)?);
             }
         }
     }

@@ -22,11 +22,11 @@ impl Revisions {
             return Some(*standing);
         }
         let standing = *self.old.get(key)?;
-        self.put(key.clone(), standing);
+        self.note(key.clone(), standing);
         Some(standing)
     }
 
-    pub(super) fn put(&mut self, key: Key, standing: Standing) {
+    pub(super) fn note(&mut self, key: Key, standing: Standing) {
         if self.young.len() >= GENERATION_KEYS {
             self.old = std::mem::take(&mut self.young);
         }
@@ -47,10 +47,10 @@ mod tests {
     fn a_row_that_is_asked_for_stays_and_one_that_is_not_goes() {
         let key = |n: usize| Key::new(Table::Attempt, n.to_string());
         let mut revisions = Revisions::default();
-        revisions.put(key(0), Some(Revision(7)));
-        revisions.put(key(1), None);
+        revisions.note(key(0), Some(Revision(7)));
+        revisions.note(key(1), None);
         for n in 2..3 * GENERATION_KEYS {
-            revisions.put(key(n), Some(Revision(1)));
+            revisions.note(key(n), Some(Revision(1)));
             if n % (GENERATION_KEYS / 2) == 0 {
                 assert_eq!(revisions.get(&key(0)), Some(Some(Revision(7))), "after {n}");
             }
@@ -64,7 +64,7 @@ mod tests {
         let key = Key::new(Table::Attempt, "a");
         let mut revisions = Revisions::default();
         revisions.old.insert(key.clone(), Some(Revision(1)));
-        revisions.put(key.clone(), None);
+        revisions.note(key.clone(), None);
         assert_eq!(revisions.get(&key), Some(None));
         revisions.forget_all();
         assert_eq!(revisions.get(&key), None);

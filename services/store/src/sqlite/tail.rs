@@ -2,7 +2,8 @@
 //!
 //! Invariant: every entry after `from` up to `head` is here, in commit order. Only the writer adds, after its commit.
 
-use crate::{FEED_PAGE_MAX, FeedPage, page_of};
+use crate::store::page_of;
+use crate::{FEED_PAGE_MAX, FeedPage};
 use midshift_core::rows::{Entry, Seq};
 use std::collections::VecDeque;
 use std::sync::{PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};

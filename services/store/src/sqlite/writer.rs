@@ -68,7 +68,7 @@ impl Writer {
             let found = write_sql::standings(connection, &self.site_id, missing).await;
             let found = found.map_err(|error| self.fail(error))?;
             for (key, standing) in found {
-                self.revisions.put(key.clone(), standing);
+                self.revisions.note(key.clone(), standing);
                 base.insert(key, standing);
             }
         }
@@ -124,12 +124,12 @@ impl Writer {
     }
 
     /// After the commit: what was written is known, then readable at the head, then announced.
-    fn take(&mut self, group: Group) {
+    fn publish_group(&mut self, group: Group) {
         if !group.grown.is_empty() {
             self.chains = Some(group.chains);
         }
         for (key, row) in group.rows {
-            self.revisions.put(key, row.map(|row| row.revision));
+            self.revisions.note(key, row.map(|row| row.revision));
         }
         if group.head > self.head {
             self.head = group.head;
@@ -149,7 +149,7 @@ impl Engine for Writer {
         if group.writes() {
             self.write(&group).await?;
         }
-        self.take(group);
+        self.publish_group(group);
         Ok(results)
     }
 
@@ -168,7 +168,7 @@ impl Engine for Writer {
             group.head = at_least;
             let written = self.write(&group).await;
             written.map_err(|(Failed::Before(cause) | Failed::AtCommit(cause))| Error::Unavailable(cause))?;
-            self.take(group);
+            self.publish_group(group);
         }
         Ok(self.head)
     }
@@ -213,7 +213,7 @@ pub(super) async fn identify(
     if sqlx::query(sql::IDENTITY).fetch_optional(&mut *connection).await.map_err(failed)?.is_none() {
         sqlx::query(sql::IDENTIFY)
             .bind(site_id.as_str())
-            .bind(crate::sql::fresh_id())
+            .bind(&*StoreId::fresh().0)
             .bind(created.0.max(0))
             .execute(&mut *connection)
             .await

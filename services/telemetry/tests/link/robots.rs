@@ -409,7 +409,7 @@ async fn a_beacon_of_a_known_robot_is_shown_as_a_hint_beside_its_presence_and_go
     robot.hears(|down| down.echo).await?;
     let ear = tokio::net::UdpSocket::bind("127.0.0.1:0").await?;
     let address = ear.local_addr()?;
-    tokio::spawn(world.service.clone().hear(ear));
+    tokio::spawn(world.service.clone().hear_beacons(ear));
     let launcher = tokio::net::UdpSocket::bind("127.0.0.1:0").await?;
     let before = get(&world).await?;
     assert_eq!(before.beacon, None);

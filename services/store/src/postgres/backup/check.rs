@@ -1,8 +1,8 @@
 //! What is wrong with a copy, found without a database: the format of its files, the kinds of its columns, its counts, and its numbers.
 
+use super::copied::{PostgresCopy, SCHEMAS, file};
 use super::tables::{Column, Kind, TableShape, tables};
-use super::{PostgresCopy, SCHEMAS, file};
-use crate::postgres::{CONTROL_SCHEMA, TELEMETRY_SCHEMA};
+use crate::postgres::connect::{CONTROL_SCHEMA, TELEMETRY_SCHEMA};
 use midshift_core::rows::Log;
 use std::collections::BTreeMap;
 use std::fs::File;

@@ -1,12 +1,12 @@
 //! A database made of a copy, in one transaction.
 
+use super::copied::{PostgresCopy, SCHEMAS, file};
 use super::copy_out::in_time;
 use super::tables::{TableShape, tables};
-use super::{PostgresCopy, SCHEMAS, file};
 use crate::amend::amended;
 use crate::migrations::{Migration, pending};
-use crate::postgres::connect::{Database, PostgresConfig};
-use crate::postgres::{CONTROL_SCHEMA, migrate, write_sql};
+use crate::postgres::connect::{CONTROL_SCHEMA, Database, PostgresConfig};
+use crate::postgres::{migrate, write_sql};
 use crate::{OpenError, StoreId, sql};
 use midshift_core::Boxed;
 use midshift_core::ids::SiteId;

@@ -1,10 +1,10 @@
 //! All tables of both schemas into files, as they were at one moment.
 
+use super::copied::{CopiedSchema, PATIENCE, PostgresCopy, SCHEMAS, file};
 use super::tables::{TableShape, tables};
-use super::{CopiedSchema, PATIENCE, PostgresCopy, SCHEMAS, file};
 use crate::migrations::{VERSION, pending};
-use crate::postgres::connect::{Database, PostgresConfig};
-use crate::postgres::{CONTROL_SCHEMA, read};
+use crate::postgres::connect::{CONTROL_SCHEMA, Database, PostgresConfig};
+use crate::postgres::read;
 use crate::{OpenError, sql};
 use midshift_core::Boxed;
 use midshift_core::rows::Seq;

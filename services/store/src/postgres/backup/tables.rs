@@ -23,11 +23,11 @@ pub(super) struct Column {
 /// What a column holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Kind {
-    /// `text`.
+    /// Of type `text`.
     Text,
-    /// `bigint`.
+    /// Of type `bigint`.
     Number,
-    /// `bytea`.
+    /// Of type `bytea`.
     Bytes,
 }
 
@@ -64,7 +64,7 @@ fn made(schema: &'static str, sql: &'static str) -> Option<TableShape> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::postgres::backup::SCHEMAS;
+    use crate::postgres::backup::copied::SCHEMAS;
     use std::path::Path;
 
     /// Whoever adds a statement of another form teaches it to [`tables`], or a copy leaves a table or a column out.

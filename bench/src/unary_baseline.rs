@@ -17,7 +17,7 @@ use tonic::{Request, Response, Status, Streaming};
 struct Unary(v1::SubmitTaskResponse);
 
 /// Serves the bare unary call until `stop`; `answer` holds the encoded response.
-pub async fn unary(answer: &Path, address: SocketAddr, stop: CancellationToken) -> anyhow::Result<()> {
+pub async fn serve(answer: &Path, address: SocketAddr, stop: CancellationToken) -> anyhow::Result<()> {
     let answer = v1::SubmitTaskResponse::decode(std::fs::read(answer)?.as_slice())?;
     let listener = TcpListener::bind(address).await?;
     Server::builder()

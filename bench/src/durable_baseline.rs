@@ -8,16 +8,16 @@ use tokio::time::Instant;
 const COMMIT_BYTES: usize = 64;
 
 /// The raw limit of a durable answer.
-pub enum Raw {
+pub enum DurableBaseline {
     /// An append to a file, with fdatasync.
     Disk(Disk),
     /// One INSERT of a small row, which is a transaction of its own, on a connection of its own.
     Commit(Box<PgConnection>),
 }
 
-impl Raw {
+impl DurableBaseline {
     /// Milliseconds of one.
-    pub async fn ms(&mut self) -> anyhow::Result<f64> {
+    pub async fn measure_ms(&mut self) -> anyhow::Result<f64> {
         match self {
             Self::Disk(disk) => disk.append_ms(),
             Self::Commit(connection) => {
@@ -33,7 +33,7 @@ impl Raw {
     pub async fn several_ms(&mut self, times: usize) -> anyhow::Result<Vec<f64>> {
         let mut took_ms = Vec::with_capacity(times);
         for _ in 0..times {
-            took_ms.push(self.ms().await?);
+            took_ms.push(self.measure_ms().await?);
         }
         Ok(took_ms)
     }

@@ -1,8 +1,8 @@
 //! Robots at the knee: each sends a heartbeat with one STATUS sample as soon as its credit lets it. And one that asks how fast an
 //! EVENT is acknowledged meanwhile.
 
-use crate::raw::Raw;
-use crate::robot::{self, Ear, Voice};
+use crate::durable_baseline::DurableBaseline;
+use crate::robot::{self, RobotReceiver, RobotSender};
 use anyhow::Context;
 use midshift_core::ids::WaypointId;
 use midshift_core::limits;
@@ -29,47 +29,55 @@ pub async fn run(server: &str, robots: usize, credit: bool, acked: Arc<AtomicU64
 
 async fn one(server: &str, number: usize, credit: bool, acked: &AtomicU64) -> anyhow::Result<()> {
     let here = WaypointId::parse(&format!("c{number}"))?;
-    let (mut voice, ear, welcome) = robot::attach(server, &format!("flood-{number:04}"), Some(here)).await?;
-    let vitals = &mut voice.reported.vitals;
+    let (mut sender, receiver, welcome) = robot::attach(server, &format!("flood-{number:04}"), Some(here)).await?;
+    let vitals = &mut sender.reported.vitals;
     vitals.pose = Some(Pose { x_mm: 12_345, y_mm: 23_456, ..Pose::default() });
     (vitals.hottest_joint_decidegrees, vitals.odometer_mm, vitals.energy_mwh) = (312, 1_234_567, 123_456);
-    let window = if credit { u64::from(welcome.status_credit_bytes) / voice.status_bytes() as u64 } else { u64::MAX };
+    let window = if credit { u64::from(welcome.status_credit_bytes) / sender.status_bytes() as u64 } else { u64::MAX };
     let (durable, heard) = watch::channel(0);
-    tokio::try_join!(send(voice, window, heard), hear(ear, durable, acked))?;
+    tokio::try_join!(send(sender, window, heard), count_acked(receiver, durable, acked))?;
     Ok(())
 }
 
-async fn send(mut voice: Voice, window: u64, mut durable: watch::Receiver<u64>) -> anyhow::Result<()> {
+async fn send(mut sender: RobotSender, window: u64, mut durable: watch::Receiver<u64>) -> anyhow::Result<()> {
     loop {
-        let written = voice.produced(Lane::Status);
+        let written = sender.produced(Lane::Status);
         durable.wait_for(|acked| written.saturating_sub(*acked) < window).await?;
-        voice.beat(true).await?;
+        sender.beat(true).await?;
     }
 }
 
-async fn hear(mut ear: Ear, durable: watch::Sender<u64>, acked: &AtomicU64) -> anyhow::Result<()> {
+async fn count_acked(
+    mut receiver: RobotReceiver,
+    durable: watch::Sender<u64>,
+    acked: &AtomicU64,
+) -> anyhow::Result<()> {
     loop {
-        let seq = ear.acked(Lane::Status).await?;
+        let seq = receiver.acked(Lane::Status).await?;
         let before = durable.send_replace(seq);
         acked.fetch_add(seq.saturating_sub(before), Relaxed);
     }
 }
 
 /// Milliseconds from each EVENT to its acknowledgement, and of the raw limit after each, one at a time, for so long.
-pub async fn ask(server: &str, raw: &mut Raw, long: Duration) -> anyhow::Result<(Vec<f64>, Vec<f64>)> {
-    let (mut voice, mut ear, _) = robot::attach(server, "asks-1", None).await?;
+pub async fn measure_acks(
+    server: &str,
+    baseline: &mut DurableBaseline,
+    long: Duration,
+) -> anyhow::Result<(Vec<f64>, Vec<f64>)> {
+    let (mut sender, mut receiver, _) = robot::attach(server, "asks-1", None).await?;
     let (started, mut beaten) = (Instant::now(), Instant::now());
     let (mut acks_ms, mut raws_ms) = (Vec::new(), Vec::new());
     while started.elapsed() < long {
         let begun = Instant::now();
-        voice.tell_mode().await?;
-        let seq = voice.produced(Lane::Event);
-        while ear.acked(Lane::Event).await? < seq {}
+        sender.send_mode().await?;
+        let seq = sender.produced(Lane::Event);
+        while receiver.acked(Lane::Event).await? < seq {}
         acks_ms.push(begun.elapsed().as_secs_f64() * 1e3);
-        raws_ms.push(raw.ms().await?);
+        raws_ms.push(baseline.measure_ms().await?);
         if beaten.elapsed().as_millis() >= u128::from(limits::HEARTBEAT.as_ms()) {
             beaten = Instant::now();
-            voice.beat(false).await?;
+            sender.beat(false).await?;
         }
         tokio::time::sleep(ASK_EVERY).await;
     }

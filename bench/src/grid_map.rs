@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 /// Writes a grid of `side` times `side` free cells.
-pub fn map(dir: &Path, side: usize) -> anyhow::Result<PathBuf> {
+pub fn write(dir: &Path, side: usize) -> anyhow::Result<PathBuf> {
     let path = dir.join("bench.map");
     let rows = format!("{}\n", ".".repeat(side)).repeat(side);
     std::fs::write(&path, format!("type octile\nheight {side}\nwidth {side}\nmap\n{rows}"))?;

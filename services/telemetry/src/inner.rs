@@ -1,0 +1,48 @@
+//! What the service is built from, and what sessions, RPCs and the tasks beside them share.
+
+use crate::bugs::Bugs;
+use crate::ear::Ear;
+use crate::event_rate::EventRates;
+use crate::misreads::Misreads;
+use crate::picture::Picture;
+use crate::registry::Registry;
+use crate::shared::Shared;
+use midshift_core::time::Clock;
+use midshift_core::work::Live;
+use midshift_store::{FrameLog, HeardLog, LiveBoard, Store};
+use std::sync::Arc;
+use tokio::sync::Semaphore;
+use tokio_util::sync::CancellationToken;
+
+/// What the service is built from.
+pub struct Parts {
+    /// The memory that services share.
+    pub store: Arc<dyn Store>,
+    /// Where STATUS is kept.
+    pub frames: Arc<dyn FrameLog>,
+    /// Newest heartbeats, read by fleet.
+    pub board: Arc<LiveBoard<Live>>,
+    /// Where other processes read them, if any may open the store too.
+    pub heard: Option<Arc<dyn HeardLog>>,
+    /// Where the time of the wall, the link and the site is read.
+    pub clock: Arc<dyn Clock>,
+    /// Naive rules for twins of tests; none outside them.
+    pub bugs: Bugs,
+}
+
+/// What its parts share.
+pub(crate) struct Inner {
+    pub parts: Parts,
+    pub picture: Picture,
+    pub registry: Registry,
+    pub event_rates: EventRates,
+    /// Robots that are refused because of what they say.
+    pub misreads: Misreads,
+    pub ear: Ear,
+    pub shared: Option<Shared>,
+    /// Room for robots that say hello.
+    pub hellos: Arc<Semaphore>,
+    /// Robots are asked to go to another gateway, and no new one is taken.
+    pub moving: CancellationToken,
+    pub shutdown: CancellationToken,
+}
