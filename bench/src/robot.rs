@@ -47,7 +47,7 @@ pub async fn attach(server: &str, name: &str, waypoint: Option<WaypointId>) -> a
 
 /// Opens a session.
 pub async fn open(server: &str, hello: Hello) -> anyhow::Result<(Voice, Ear, Welcome)> {
-    let channel = TcpDial::new(&midshift_cli::way::uri(server), None)?.dial().await?;
+    let channel = TcpDial::new(&midshift_cli::endpoint::uri(server), None)?.dial().await?;
     let (up, outbound) = mpsc::channel(OUTBOUND);
     let reported = hello.reported.clone();
     up.send((&FromRobot::Hello(Box::new(hello))).into()).await?;

@@ -2,13 +2,13 @@
 
 use crate::clock;
 use crate::door;
-use crate::machines::Machines;
+use crate::enrol_simulated::Machines;
 use crate::software::{self, Behaving};
 use anyhow::{Context, bail};
 use midshift_agent::core::ExitReason;
 use midshift_agent::program::{Machine, Ways};
+use midshift_cli::endpoint::{Endpoint, with_scheme};
 use midshift_cli::site_file;
-use midshift_cli::way::{Way, with_scheme};
 use midshift_core::Boxed;
 use midshift_core::ids::WaypointId;
 use midshift_core::time::Clock;
@@ -184,11 +184,11 @@ async fn visit(robot: SimHandle, seed: u64, clock: Arc<dyn Clock>) {
 }
 
 /// Runs a swarm until `stop`; enrolled by whoever is signed in, or in plain text.
-pub fn swarm(args: SimRun, signed_in: Option<Way>, stop: CancellationToken) -> Boxed<'static, anyhow::Result<()>> {
+pub fn swarm(args: SimRun, signed_in: Option<Endpoint>, stop: CancellationToken) -> Boxed<'static, anyhow::Result<()>> {
     Box::pin(swarming(args, signed_in, stop))
 }
 
-async fn swarming(args: SimRun, signed_in: Option<Way>, stop: CancellationToken) -> anyhow::Result<()> {
+async fn swarming(args: SimRun, signed_in: Option<Endpoint>, stop: CancellationToken) -> anyhow::Result<()> {
     let site = site_file::load(args.site.as_deref(), None, None)?.site;
     let clock: Arc<dyn Clock> = clock::clock(1000);
     let mut config = HallConfig::new(site, args.robots, args.seed);
@@ -217,7 +217,9 @@ async fn swarming(args: SimRun, signed_in: Option<Way>, stop: CancellationToken)
     if let Some(address) = args.stop.address(&args.server, machines.is_some()) {
         swarm = swarm.with_stop(&with_scheme(scheme, &address));
     }
-    let _renewing = machines.map(|machines| machines.keep(args.identity.address(&args.server), &clock)).transpose()?;
+    let _renewing = machines
+        .map(|machines| machines.renew_certificates(args.identity.address(&args.server), &clock))
+        .transpose()?;
     swarm.software = trust;
     swarm.persistence = config.persistence.clone();
     let swarm = Swarm::new(swarm);

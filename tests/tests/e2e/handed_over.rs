@@ -3,7 +3,7 @@
 
 use crate::harness::{Server, channel, folder};
 use anyhow::{Context, ensure};
-use midshift::machines::Machines;
+use midshift::enrol_simulated::Machines;
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_agent::tls::Tls;
 use midshift_core::ids::RobotId;

@@ -4,7 +4,7 @@ use crate::harness::{Running, channel, has_login, midshift, sign_in, until, way}
 use crate::secrets::{keep_key, keep_secret, secret_part};
 use crate::stack::{machines_of, tell_identity};
 use anyhow::Context;
-use midshift::machines::Machines;
+use midshift::enrol_simulated::Machines;
 use midshift_agent::device::DeviceKey;
 use midshift_agent::enrolment::enrol;
 use midshift_agent::ledger::Ledger;

@@ -3,7 +3,7 @@
 //! Invariant: rows that let somebody in become a store only with a list of revocations, or by a person's word. Both engines are put right before
 //! their rows make a server of the rest.
 
-use super::blocking;
+use super::files::blocking;
 use super::part::Making;
 use anyhow::{Context, bail};
 use midshift_core::identity::Revocation;

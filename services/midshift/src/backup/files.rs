@@ -51,3 +51,10 @@ pub(super) fn copy_if_there(from: &Path, to: &Path) -> anyhow::Result<()> {
 pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     fs::write(path, bytes).with_context(|| format!("writing {}", path.display()))
 }
+
+/// Does work with files beside the runtime's threads.
+pub(super) async fn blocking<T: Send + 'static>(
+    work: impl FnOnce() -> anyhow::Result<T> + Send + 'static,
+) -> anyhow::Result<T> {
+    tokio::task::spawn_blocking(work).await.context("work with files ended")?
+}

@@ -1,8 +1,7 @@
 //! The site's authority and the server's own key.
 
-use super::files::{copy, entries};
-use super::part::{Making, Part, Said};
-use super::{Places, blocking};
+use super::files::{blocking, copy, entries};
+use super::part::{Making, Part, Places, Said};
 use anyhow::ensure;
 use async_trait::async_trait;
 use midshift_identity::{FOLDER, RevocationList};

@@ -1,8 +1,7 @@
 //! Online keys.
 
-use super::files::{copy, entries};
-use super::part::{KEYS, Making, Part, Said};
-use super::{Places, blocking};
+use super::files::{blocking, copy, entries};
+use super::part::{KEYS, Making, Part, Places, Said};
 use anyhow::ensure;
 use async_trait::async_trait;
 use std::fs;

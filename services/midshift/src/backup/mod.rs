@@ -19,12 +19,12 @@ pub mod told;
 
 pub use access::{Access, Identity, Settled};
 use anyhow::{Context, bail, ensure};
-use files::write;
+use files::{blocking, write};
 use midshift_bundle::digest::Digest;
 use midshift_core::Boxed;
 use midshift_core::time::Utc;
-use midshift_store::{PostgresConfig, PostgresRestore, RestoreError, StoreId};
-pub use part::KEYS;
+use midshift_store::{PostgresRestore, RestoreError, StoreId};
+pub use part::{KEYS, Places};
 use part::{Making, POSTGRES, Said};
 use parts::PARTS;
 use place::Place;
@@ -39,17 +39,6 @@ const LIST: &str = "backup.json";
 const FORMAT: u32 = 1;
 /// A file of a backup has at most so many bytes.
 const FILE_BYTES_MAX: u64 = 1 << 42;
-
-/// Where a server keeps what is durable.
-#[derive(Clone, Debug)]
-pub struct Places {
-    /// Its data directory.
-    pub data: PathBuf,
-    /// The folder of its online keys, if it has any.
-    pub ota_keys: Option<PathBuf>,
-    /// The database of its rows; none: they are files of SQLite in the data directory.
-    pub store: Option<PostgresConfig>,
-}
 
 /// One file of a backup.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -277,10 +266,6 @@ fn differences(list: &BTreeMap<String, Kept>, found: &BTreeMap<String, Kept>) ->
     let strange = found.keys().filter(|path| !list.contains_key(*path)).map(|path| format!("{path} is not listed"));
     let other = list.iter().filter(|(path, kept)| found.get(*path).is_some_and(|f| f != *kept));
     missing.chain(strange).chain(other.map(|(path, _)| format!("{path} is not what was copied"))).collect()
-}
-
-async fn blocking<T: Send + 'static>(work: impl FnOnce() -> anyhow::Result<T> + Send + 'static) -> anyhow::Result<T> {
-    tokio::task::spawn_blocking(work).await.context("work with files ended")?
 }
 
 #[cfg(test)]

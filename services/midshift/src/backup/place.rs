@@ -3,7 +3,7 @@
 //! Invariant: a folder gets its name when all of it is durable; until then it is under a name of its own beside it, and goes when it is dropped.
 //! Of one whose name may not be durable the name is taken back, or what is there is said.
 
-use super::blocking;
+use super::files::blocking;
 use anyhow::{Context, ensure};
 use std::fs::{self, File};
 use std::os::unix::fs::PermissionsExt;

@@ -1,8 +1,7 @@
 //! Signed documents of releases, and their files.
 
-use super::files::{copy, copy_if_there, entries, must, read};
-use super::part::{Making, Part, Said};
-use super::{Places, blocking};
+use super::files::{blocking, copy, copy_if_there, entries, must, read};
+use super::part::{Making, Part, Places, Said};
 use anyhow::ensure;
 use async_trait::async_trait;
 use midshift_bundle::digest::Digest;

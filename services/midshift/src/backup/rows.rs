@@ -1,8 +1,7 @@
 //! Rows and samples: two files of SQLite, or two schemas of PostgreSQL.
 
-use super::files::{must, write};
-use super::part::{Making, POSTGRES, Part, Said};
-use super::{Places, blocking};
+use super::files::{blocking, must, write};
+use super::part::{Making, POSTGRES, Part, Places, Said};
 use anyhow::{Context, bail};
 use async_trait::async_trait;
 use midshift_store::{Database, PostgresCopy, PostgresRestore, StoreId};

@@ -3,9 +3,8 @@
 //! What a restore brings back is what was engaged at the backup. A reset that came later is not in it: that stop is engaged again for the service and for robots that
 //! have not heard of the reset; those that have do not obey it, and say so. It is reset by name once more. A stop that came later is brought back by robots, who keep it themselves, and taken from them because the key is the same.
 
-use super::files::{copy, copy_if_there, entries};
-use super::part::{Making, Part, Said};
-use super::{Places, blocking};
+use super::files::{blocking, copy, copy_if_there, entries};
+use super::part::{Making, Part, Places, Said};
 use crate::stop::{FOLDER, LOG};
 use anyhow::{Context, ensure};
 use async_trait::async_trait;

@@ -8,7 +8,7 @@ use midshift_agent::dial::TcpDial;
 use midshift_agent::enrolment::{Enrolled, Identity, Invitation};
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::tls::Tls;
-use midshift_cli::way::Way;
+use midshift_cli::endpoint::Endpoint;
 use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
 use midshift_core::time::Clock;
@@ -25,7 +25,7 @@ use tokio_util::task::AbortOnDropHandle;
 /// So many are enrolled at a time.
 const AT_ONCE: usize = 32;
 
-/// Machines and who they are.
+/// Simulated machines, and which robot each is.
 pub struct Machines(Vec<Identity>);
 
 impl Machines {
@@ -35,20 +35,20 @@ impl Machines {
     /// # Errors
     /// The server says no.
     pub fn enrol<'a>(
-        way: &'a Way,
+        identities: &'a Endpoint,
         server: &'a str,
         robots: Vec<RobotId>,
         data: Option<&'a Path>,
     ) -> Boxed<'a, anyhow::Result<Self>> {
         Box::pin(async move {
-            let (room, line) = (Arc::new(Semaphore::new(AT_ONCE)), way.lazy());
+            let (room, line) = (Arc::new(Semaphore::new(AT_ONCE)), identities.lazy());
             let mut joined = JoinSet::new();
             for robot_id in robots {
                 let (client, server) = (IdentityServiceClient::new(line.clone()), server.to_owned());
                 let (folder, room) = (data.map(|data| data.join(robot_id.as_str())), room.clone());
                 joined.spawn(async move {
                     let _place = room.acquire_owned().await?;
-                    let machine = machine(client, &server, &robot_id, folder).await;
+                    let machine = enrol_one(client, &server, &robot_id, folder).await;
                     machine.with_context(|| format!("enrolling {robot_id}"))
                 });
             }
@@ -69,17 +69,21 @@ impl Machines {
     ///
     /// # Errors
     /// The address is none.
-    pub fn keep(self, server: &str, clock: &Arc<dyn Clock>) -> anyhow::Result<Vec<AbortOnDropHandle<()>>> {
-        let keep = |machine: Identity| {
+    pub fn renew_certificates(
+        self,
+        server: &str,
+        clock: &Arc<dyn Clock>,
+    ) -> anyhow::Result<Vec<AbortOnDropHandle<()>>> {
+        let renew = |machine: Identity| {
             let dial = TcpDial::new(&format!("https://{server}"), None)?.with_tls(machine.tls());
             Ok(AbortOnDropHandle::new(tokio::spawn(machine.keep(Arc::new(dial), clock.clone()))))
         };
-        self.0.into_iter().map(keep).collect()
+        self.0.into_iter().map(renew).collect()
     }
 }
 
-async fn machine(
-    mut client: IdentityServiceClient<midshift_cli::way::Line>,
+async fn enrol_one(
+    mut client: IdentityServiceClient<midshift_cli::endpoint::Line>,
     server: &str,
     robot_id: &RobotId,
     folder: Option<PathBuf>,

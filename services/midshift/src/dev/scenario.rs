@@ -30,12 +30,10 @@ use tokio::process::{Child, Command};
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Channel;
 pub use watch::Sight;
-use watch::{FirstRuns, Watcher};
+use watch::{FirstRuns, LOOK_EVERY, Watcher};
 
 /// Robots that are processes of their own, unless the fleet is too small for it.
 pub const LAUNCHED: usize = 5;
-/// How often robots and roll-outs are looked at, real time.
-const LOOK_EVERY: Duration = Duration::from_millis(200);
 /// A roll-out that takes longer is given up, real time.
 const LONGEST: Duration = Duration::from_secs(1_200);
 /// All robots must be at work within this, real time.
@@ -301,7 +299,7 @@ impl Stage {
             Err(_) => self.until(&rollout_id, has_ended).await?,
         };
         let (seen, most) = watcher.seen().await;
-        self.judge(release, &rollout, &before, Played::of(seen, most, wall_s)).await
+        self.judge(release, &rollout, &before, Played::from_seen(seen, most, wall_s)).await
     }
 
     /// The roll-out, as soon as it is so.
