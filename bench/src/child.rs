@@ -166,6 +166,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 listen: None,
                 trust: None,
                 identity: IdentityFlags::default(),
+                replace: false,
                 stop: StopFlags::default(),
             };
             midshift::robots::swarm(swarm, None, stop).await

@@ -32,6 +32,8 @@ use tokio::sync::watch;
 
 /// The hardware model of a simulated robot, as bundles name it.
 pub const MODEL: &str = "midshift-sim";
+/// Key and value of the label by which a simulated robot says what it is.
+pub const BODY_LABEL: (&str, &str) = ("body", "simulated");
 /// The fastest a simulated body goes, millimetres per second.
 pub const SPEED_MAX_MM_S: u32 = 1_500;
 /// The slowest it is asked to go, millimetres per second; also its speed at the stop level SLOW.

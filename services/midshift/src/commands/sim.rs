@@ -28,11 +28,11 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
         Verb::Run { run, login } => {
             let resolved = login.resolve(Some(&run.server))?;
-            let endpoint = match resolved.is_secure() {
-                true => Some(resolved.endpoint(run.identity.address(&run.server))?),
+            let signed_in = match resolved.is_secure() {
+                true => Some([resolved.endpoint(run.identity.address(&run.server))?, resolved.endpoint(&run.server)?]),
                 false => None,
             };
-            Ok(swarm(*run, endpoint, interrupts()).await?)
+            Ok(swarm(*run, signed_in, interrupts()).await?)
         }
         Verb::Ask(verb) => midshift_cli::run(Command::Sim(verb), out).await,
     }
