@@ -1,4 +1,5 @@
-//! The endpoint of a server for people, programs and tests: its address, the site's root if it speaks TLS, and the token that is shown with each request.
+//! The endpoint of a server for people, programs and tests: its address, the site's root if it speaks TLS, and the
+//! token that is shown with each request.
 //!
 //! Invariant: a token is sent over TLS alone, and never printed: nothing here has a Debug that shows it.
 
@@ -17,7 +18,8 @@ pub use midshift_agent::dial::with_scheme;
 
 /// A server that does not answer a connection within this is not there.
 const CONNECT_WITHIN: Duration = Duration::from_secs(3);
-/// A connection with a call under way on which nothing came for so long is asked for a sign of life, and is gone if none comes within [`ALIVE_WITHIN`].
+/// A connection with a call under way on which nothing came for so long is asked for a sign of life, and is gone if
+/// none comes within [`ALIVE_WITHIN`].
 const QUIET: Duration = Duration::from_secs(30);
 const ALIVE_WITHIN: Duration = Duration::from_secs(20);
 

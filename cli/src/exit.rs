@@ -51,7 +51,8 @@ impl Exit {
         let remedy = if code == NO_SERVER { Remedy::Later } else { Remedy::None };
         Self { code, text: text.into(), remedy }
     }
-    /// What was heard cannot be written. If nobody reads any more there is nobody to tell either, and the end is that of a program that wrote into a closed pipe.
+    /// What was heard cannot be written. If nobody reads any more there is nobody to tell either, and the end is that
+    /// of a program that wrote into a closed pipe.
     pub fn unwritten(why: ErrorKind) -> Self {
         match why {
             ErrorKind::BrokenPipe => Self::new(UNREAD, ""),
@@ -74,7 +75,8 @@ impl Exit {
     pub fn code(&self) -> u8 {
         self.code
     }
-    /// The same end with the facts that the server sent beside its sentence: which roll-out, how many robots for which reason.
+    /// The same end with the facts that the server sent beside its sentence: which roll-out, how many robots for which
+    /// reason.
     pub fn with_facts(status: Status) -> Self {
         let facts = midshift_proto::refusal_of(&status).metadata;
         let mut exit = Self::from(status);

@@ -180,7 +180,8 @@ pub fn few(names: Vec<String>) -> Vec<String> {
     names.into_iter().take(NAMES_SHOWN).chain(more).collect()
 }
 
-/// Columns as wide as their widest cell. Ours: a crate for tables brings two more with it, and leaves no columns out by how much they matter.
+/// Columns as wide as their widest cell. Ours: a crate for tables brings two more with it, and leaves no columns out by
+/// how much they matter.
 pub fn columns(header: &[&str], rows: &[Vec<String>]) -> String {
     let rows: Vec<Vec<Cow<'_, str>>> = rows.iter().map(|row| row.iter().map(|cell| plain(cell)).collect()).collect();
     let mut widths: Vec<usize> = header.iter().map(|h| h.len()).collect();

@@ -68,7 +68,8 @@ pages! {
     telemetry::ListRobotsResponse { robots: telemetry::Robot }
 }
 
-/// Reads all pages into one, by a function of the page's token. What an answer says beside its things is that of the last page.
+/// Reads all pages into one, by a function of the page's token. What an answer says beside its things is that of the
+/// last page.
 ///
 /// # Errors
 /// What the server says to any page.

@@ -1,6 +1,7 @@
 //! `midshift stop --all|--robot|--zone|--area`: engages a stop and follows what each robot confirms.
 //!
-//! Invariant: nothing is shown as standing that a robot has not said itself. A broken answer is asked for again under the same name: that engages nothing more.
+//! Invariant: nothing is shown as standing that a robot has not said itself. A broken answer is asked for again under
+//! the same name: that engages nothing more.
 
 use super::target::{AGAIN_AFTER, StopCall};
 use super::words::{confirmed, in_site, level, summary, whom};
@@ -240,7 +241,8 @@ impl Told {
             .or_try("midshift stop status")
     }
 
-    /// Whether nobody waits for this robot's word any more: a stop of one robot waits for that one alone, and no stop for one that said it lies elsewhere.
+    /// Whether nobody waits for this robot's word any more: a stop of one robot waits for that one alone, and no stop
+    /// for one that said it lies elsewhere.
     fn is_settled(&self, robot: &v1::RobotStop) -> bool {
         use v1::Confirmation as C;
         if let Some(Scope::RobotId(meant)) = self.stop.scope.as_ref().and_then(|s| s.scope.as_ref())

@@ -99,7 +99,8 @@ pub async fn run(args: Submit, out: &Out) -> Result<(), Exit> {
     Ok(())
 }
 
-/// Refuses to send tasks for robots that the server does not know: one task of each robot is checked, and nothing is stored.
+/// Refuses to send tasks for robots that the server does not know: one task of each robot is checked, and nothing is
+/// stored.
 async fn robots_are_known(args: &Submit, tasks: impl IntoIterator<Item = &v1::SubmitTaskRequest>) -> Result<(), Exit> {
     if args.unknown_robot {
         return Ok(());

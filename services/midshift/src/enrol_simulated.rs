@@ -1,7 +1,9 @@
-//! Simulated machines become robots of a site: each with a key and a certificate of its own, enrolled by whoever is signed in.
+//! Simulated machines become robots of a site: each with a key and a certificate of its own, enrolled by whoever is
+//! signed in.
 //!
-//! Invariant: what a simulated robot shows is what a real one would: the server makes no difference. No robot loses its machine to a simulated one but one that
-//! said itself that its body is simulated ([`BODY_LABEL`]), unless the caller gives all names away.
+//! Invariant: what a simulated robot shows is what a real one would: the server makes no difference. No robot loses its
+//! machine to a simulated one but one that said itself that its body is simulated ([`BODY_LABEL`]), unless the caller
+//! gives all names away.
 
 use anyhow::{Context, ensure};
 use midshift_agent::device::{self, DeviceKey};
@@ -50,8 +52,8 @@ pub enum Replace {
 }
 
 impl Replaced {
-    /// Finds out at `identities`, and at the server `robots` that they dial, which of `robot_ids` have a machine and may lose it. One whose folder below `data` has
-    /// its certificate keeps it.
+    /// Finds out at `identities`, and at the server `robots` that they dial, which of `robot_ids` have a machine and
+    /// may lose it. One whose folder below `data` has its certificate keeps it.
     ///
     /// # Errors
     /// A robot has another machine and is not known to be simulated; a server says no.
@@ -104,8 +106,9 @@ impl Replaced {
     }
 }
 
-/// Whether the machine that was enrolled then said at its Hello that its body is simulated. What an older machine of the robot said does not count; one that never
-/// said Hello may be a real one. Epochs of sessions are unix milliseconds.
+/// Whether the machine that was enrolled then said at its Hello that its body is simulated. What an older machine of
+/// the robot said does not count; one that never said Hello may be a real one. Epochs of sessions are unix
+/// milliseconds.
 fn is_simulated(robot: &Robot, enrolled: Utc) -> bool {
     let (key, value) = BODY_LABEL;
     let said = robot.inventory.as_ref().and_then(|inventory| inventory.labels.get(key));
@@ -128,8 +131,8 @@ fn refusal(names: &[&str]) -> String {
 pub struct Machines(Vec<Identity>);
 
 impl Machines {
-    /// Enrols each of `robots` at `server`, unless its folder below `data` says that it is. Without folders each run brings new machines, which take the places of
-    /// those of the run before where they are among `replaced`.
+    /// Enrols each of `robots` at `server`, unless its folder below `data` says that it is. Without folders each run
+    /// brings new machines, which take the places of those of the run before where they are among `replaced`.
     ///
     /// # Errors
     /// The server says no, as of a robot that has a machine and is not replaced.

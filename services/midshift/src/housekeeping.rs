@@ -1,7 +1,8 @@
-//! Housekeeping of every process: prunes old rows, entries and frames of its roles, tends the chains of the audit, folds samples of histograms.
+//! Housekeeping of every process: prunes old rows, entries and frames of its roles, tends the chains of the audit,
+//! folds samples of histograms.
 //!
-//! Which of it goes when is in [`midshift_core::privacy::KEPT`]. Called by [`crate::server`]. Invariant: nothing goes that a service has not consumed,
-//! unless it has not been there for a month.
+//! Which of it goes when is in [`midshift_core::privacy::KEPT`]. Called by [`crate::server`]. Invariant: nothing goes
+//! that a service has not consumed, unless it has not been there for a month.
 
 mod oldest;
 
@@ -43,7 +44,8 @@ async fn fold(metrics: Option<PrometheusHandle>) {
     }
 }
 
-/// Takes old rows, entries and frames away, entries never past what fleet and roll-outs have not consumed, and tells how old the rest is.
+/// Takes old rows, entries and frames away, entries never past what fleet and roll-outs have not consumed, and tells
+/// how old the rest is.
 async fn prune(parts: &Components, task: Option<TaskService>) {
     let (store, frames, clock) = (parts.store.as_ref(), parts.frames.as_ref(), parts.clock.as_ref());
     loop {
@@ -143,8 +145,9 @@ async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), Error
     store.prune(keep).await.map(drop)
 }
 
-/// Whether whoever moved this mark is gone, or will not read on from it: the first entry behind it is older than anything about what is gone is
-/// kept, or gone itself. A process of roll-outs that comes back reads the rows, and the log from its oldest entry on.
+/// Whether whoever moved this mark is gone, or will not read on from it: the first entry behind it is older than
+/// anything about what is gone is kept, or gone itself. A process of roll-outs that comes back reads the rows, and the
+/// log from its oldest entry on.
 async fn is_abandoned(store: &dyn Store, mark: Seq, wall: Utc) -> Result<bool, Error> {
     let page = match store.feed(mark, &Log::ALL, 1).await {
         Err(Error::CursorExpired { asked, oldest }) => return Ok(asked < oldest),

@@ -32,9 +32,10 @@ pub struct Dev {
     pub seed: u64,
     /// Stop after so much site time (e.g. 10m) instead of at Ctrl-C, and fail if the run was not good.
     ///
-    /// Good is: no place ever too full, no item lost or doubled, no step done twice, every task accounted for, and at most twice the
-    /// robots' number of tasks open (unless --keep-open or --rate). From 5m on also: at most 2 % of the tasks, or one, with an operator;
-    /// and 8 tasks a robot succeeded in 10m, in the built-in factory with its own work and up to 20 robots.
+    /// Good is: no place ever too full, no item lost or doubled, no step done twice, every task accounted for, and at
+    /// most twice the robots' number of tasks open (unless --keep-open or --rate). From 5m on also: at most 2 % of the
+    /// tasks, or one, with an operator; and 8 tasks a robot succeeded in 10m, in the built-in factory with its own work
+    /// and up to 20 robots.
     #[arg(long = "for", value_parser = midshift_cli::duration)]
     pub run_for: Option<Duration>,
     /// Keep everything in this directory instead of in memory.
@@ -46,7 +47,8 @@ pub struct Dev {
     /// Address to listen on, loopback only. Port 0 takes a free one.
     #[arg(long, default_value = "127.0.0.1:7420")]
     pub listen: SocketAddr,
-    /// UDP address to hear launchers of robots on whose agent does not run. By default 127.0.0.1:7422, if nobody else has it.
+    /// UDP address to hear launchers of robots on whose agent does not run. By default 127.0.0.1:7422, if nobody else
+    /// has it.
     #[arg(long, value_name = "ADDR")]
     pub beacon_listen: Option<SocketAddr>,
     /// Keep so many tasks open. The default with --for is twice the robots.
@@ -55,10 +57,12 @@ pub struct Dev {
     /// Submit so many tasks an hour of site time, e.g. 300/h.
     #[arg(long, value_parser = rate)]
     pub rate: Option<f64>,
-    /// Play a story and fail if it did not go as it should. Five of the robots are launcher and agent processes; --speedup is that of bodies.
+    /// Play a story and fail if it did not go as it should. Five of the robots are launcher and agent processes;
+    /// --speedup is that of bodies.
     #[arg(long, value_enum, conflicts_with_all = ["run_for", "map", "data", "rate"])]
     pub scenario: Option<Scenario>,
-    /// Which bundles the story rolls out, in this order, each once. Robots must keep the good one and go back from every other.
+    /// Which bundles the story rolls out, in this order, each once. Robots must keep the good one and go back from
+    /// every other.
     #[arg(
         long,
         value_enum,
@@ -70,7 +74,8 @@ pub struct Dev {
     /// How long the story's roll-outs keep a robot on probation and let a wave soak, e.g. 3s.
     #[arg(long, value_parser = midshift_cli::duration, requires = "scenario", default_value = "10s")]
     pub watched: Duration,
-    /// Nothing goes wrong by itself. What is bad only with a load makes such faults more frequent, so a story does without that bundle then.
+    /// Nothing goes wrong by itself. What is bad only with a load makes such faults more frequent, so a story does
+    /// without that bundle then.
     #[arg(long)]
     pub no_faults: bool,
 }

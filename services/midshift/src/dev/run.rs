@@ -130,8 +130,8 @@ impl Run {
         }
     }
 
-    /// Takes a person's word for the clock, where there is a folder to leave it in. The clock of the start is not held against the store: what is signed
-    /// here, and who believes it, is made anew by the same clock.
+    /// Takes a person's word for the clock, where there is a folder to leave it in. The clock of the start is not held
+    /// against the store: what is signed here, and who believes it, is made anew by the same clock.
     fn accept_clock(&self) -> Option<AbortOnDropHandle<()>> {
         let (data, clock, store) = (self.args.data.clone()?, self.clock.clone(), self.store.clone());
         let words = async move { clock_doubt::run(&data, &*clock, &*store).await };

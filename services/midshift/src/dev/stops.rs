@@ -22,7 +22,8 @@ pub struct Stops {
 }
 
 impl Stops {
-    /// On the usual port, or on a free one if that is taken or the server asked for a free one too. With a new store it begins with nothing engaged.
+    /// On the usual port, or on a free one if that is taken or the server asked for a free one too. With a new store it
+    /// begins with nothing engaged.
     pub async fn start(
         args: &Dev,
         site: Arc<Site>,

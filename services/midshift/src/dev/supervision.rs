@@ -1,6 +1,8 @@
-//! Watches over the tasks of a run that must last as long as it does: one that ends early ends the run with its name and its error.
+//! Watches over the tasks of a run that must last as long as it does: one that ends early ends the run with its name
+//! and its error.
 //!
-//! Invariant: a part is waited for once; after [`RunningTasks::first_end`] has given an error nothing here is used again. Called by `dev`.
+//! Invariant: a part is waited for once; after [`RunningTasks::first_end`] has given an error nothing here is used
+//! again. Called by `dev`.
 
 use anyhow::{Context, anyhow};
 use tokio::task::{JoinError, JoinHandle};
