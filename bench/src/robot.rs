@@ -51,7 +51,7 @@ pub async fn attach(
 
 /// Opens a session.
 pub async fn open(server: &str, hello: Hello) -> anyhow::Result<(RobotSender, RobotReceiver, Welcome)> {
-    let channel = TcpDial::new(&midshift_cli::way::uri(server), None)?.dial().await?;
+    let channel = TcpDial::new(&midshift_cli::endpoint::uri(server), None)?.dial().await?;
     let (up, outbound) = mpsc::channel(OUTBOUND);
     let reported = hello.reported.clone();
     up.send((&FromRobot::Hello(Box::new(hello))).into()).await?;

@@ -96,7 +96,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             };
             let answer = client.put_area_policy(unary(request)).await?.into_inner();
             show(&answer.policy.unwrap_or_default(), out)?;
-            out.say(&format!("pushed to {} robots", answer.robots));
+            out.inform(&format!("pushed to {} robots", answer.robots));
             Ok(())
         }
     }

@@ -3,6 +3,7 @@
 use super::client::{Call, Exit, unary};
 use super::duration;
 use super::out::{Format, Out, columns};
+use super::pages::{self, Listed, PAGE_SIZE};
 use anyhow::Context;
 use clap::Subcommand;
 use midshift_core::audit::{Export, Head, Held, Mark};
@@ -97,7 +98,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
                 action_prefix: action,
                 since: since.map(timestamp),
                 until: until.map(timestamp),
-                page_size: 1_000,
+                page_size: PAGE_SIZE,
                 page_token: String::new(),
             };
             list(&call, request, if limit == 0 { usize::MAX } else { limit }, out).await
@@ -114,49 +115,43 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     }
 }
 
-async fn list(call: &Call, mut request: v1::ListAuditRequest, limit: usize, out: &Out) -> Result<(), Exit> {
+async fn list(call: &Call, request: v1::ListAuditRequest, limit: usize, out: &Out) -> Result<(), Exit> {
     let mut client = call.audit().await?;
-    let mut whole = v1::ListAuditResponse::default();
-    loop {
-        let page = client.list_audit(unary(request.clone())).await?.into_inner();
-        whole.rows.extend(page.rows);
-        whole.next_page_token = page.next_page_token;
-        if whole.next_page_token.is_empty() || whole.rows.len() >= limit {
-            break;
-        }
-        request.page_token.clone_from(&whole.next_page_token);
-    }
+    let read =
+        async |page_token| client.list_audit(unary(v1::ListAuditRequest { page_token, ..request.clone() })).await;
+    let mut whole = pages::first(limit, read).await?;
     let is_cut = whole.rows.len() > limit || !whole.next_page_token.is_empty();
     whole.rows.truncate(limit);
-    let header = ["AT", "ROW", "ACTOR", "ACTION", "ABOUT", "OUTCOME", "REASON"];
-    out.many(&whole, &whole.rows, name, &header, row)?;
+    out.list(&whole)?;
     if is_cut {
         out.next("older rows: the same with --until, or --limit 0 for all");
     }
     Ok(())
 }
 
-fn name(row: &v1::AuditRow) -> String {
-    format!("{}:{}", row.service, row.n)
-}
-
-fn row(row: &v1::AuditRow) -> Vec<String> {
-    let heads = row.heads.iter().map(|head| format!("{}:{}", head.service, head.n));
-    let mut about: Vec<String> = row.about.iter().cloned().chain(heads).collect();
-    if about.len() > ABOUT_SHOWN {
-        let more = about.len() - ABOUT_SHOWN;
-        about.truncate(ABOUT_SHOWN);
-        about.push(format!("and {more} more"));
+impl Listed for v1::AuditRow {
+    const HEADER: &'static [&'static str] = &["AT", "ROW", "ACTOR", "ACTION", "ABOUT", "OUTCOME", "REASON"];
+    fn name(&self) -> String {
+        format!("{}:{}", self.service, self.n)
     }
-    vec![
-        row.time.as_ref().map(|t| time_of(t).rfc3339()).unwrap_or_default(),
-        name(row),
-        row.actor.clone(),
-        row.action.clone(),
-        about.join(" "),
-        row.outcome.clone(),
-        row.reason.clone(),
-    ]
+    fn row(&self) -> Vec<String> {
+        let heads = self.heads.iter().map(|head| format!("{}:{}", head.service, head.n));
+        let mut about: Vec<String> = self.about.iter().cloned().chain(heads).collect();
+        if about.len() > ABOUT_SHOWN {
+            let more = about.len() - ABOUT_SHOWN;
+            about.truncate(ABOUT_SHOWN);
+            about.push(format!("and {more} more"));
+        }
+        vec![
+            self.time.as_ref().map(|t| time_of(t).rfc3339()).unwrap_or_default(),
+            self.name(),
+            self.actor.clone(),
+            self.action.clone(),
+            about.join(" "),
+            self.outcome.clone(),
+            self.reason.clone(),
+        ]
+    }
 }
 
 /// Hands over each line of an export, and gives back the first.
@@ -197,7 +192,7 @@ async fn export_to(call: &Call, path: &Path, out: &Out) -> Result<(), Exit> {
             return Err(exit);
         }
     };
-    out.say(&format!("{} rows in {}", lines.saturating_sub(1), path.display()));
+    out.inform(&format!("{} rows in {}", lines.saturating_sub(1), path.display()));
     for (service, head) in &export.heads {
         match out.format {
             Format::Json | Format::Jsonl => {}
@@ -262,7 +257,7 @@ async fn verify(call: &Call, noted: Vec<Mark>, out: &Out) -> Result<v1::VerifyAu
         }
         // Between chains that hardly have rows there is nothing to tell.
         if message.rows_read >= TOLD_FROM {
-            out.say(&format!("{} rows read", message.rows_read));
+            out.inform(&format!("{} rows read", message.rows_read));
         }
     }
     Err(Exit::new(5, "the server ended before it was through\n  try: the same again"))

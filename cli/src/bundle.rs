@@ -1,5 +1,6 @@
 //! `midshift bundle …`: what release people do with keys and bundles. Only `push`, `ls` and `revoke` need a server.
 
+mod files;
 mod root;
 
 use super::client::{Call, Change, Exit};
@@ -7,17 +8,16 @@ use super::out::{Format, Out};
 use super::{push, released};
 use crate::samples::{self, Signer};
 use clap::{Subcommand, ValueEnum};
+use files::{bytes_of, print_json, public_key, read_keys, read_signatures};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_agent::clock;
 use midshift_bundle::build;
 use midshift_bundle::folder::{Error, Folder, Signed};
 use midshift_bundle::key_set::{ENVELOPE_BYTES_MAX, KeySet};
-use midshift_bundle::keys::{PublicKey, SecretKey};
+use midshift_bundle::keys::SecretKey;
 use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::Profile;
-use midshift_core::limits::SIGNED_DOCUMENT_BYTES;
-use std::fs::File;
-use std::io::{IsTerminal, Read};
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
 /// Verbs of bundles.
@@ -217,7 +217,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             }
             let what = match bundle {
                 Some(bundle) => What::New(bundle, from),
-                None if pending => What::Pending(handed(&signature)?),
+                None if pending => What::Pending(read_signatures(&signature)?),
                 None => What::Again,
             };
             sign(&what, &repository, &key, out)
@@ -249,18 +249,11 @@ fn keygen(profile: Who, keys: &Path, repository: &Path, out: &Out) -> Result<(),
         Who::Team => "one of three keys signs; put the third into a safe",
         Who::Release => "two of three keys must sign; give each to another person",
     };
-    told(&serde_json::json!({"keys": keys, "repository": repository, "rootVersion": 1}), out);
-    out.say(&format!("keys in {}, repository in {}: {who}", keys.display(), repository.display()));
-    out.say("root-*.pem change who may sign: take them off this machine. snapshot, timestamp and directive belong to the server");
+    print_json(&serde_json::json!({"keys": keys, "repository": repository, "rootVersion": 1}), out);
+    out.inform(&format!("keys in {}, repository in {}: {who}", keys.display(), repository.display()));
+    out.inform("root-*.pem change who may sign: take them off this machine. snapshot, timestamp and directive belong to the server");
     out.next("midshift bundle build FOLDER --out BUNDLE");
     Ok(())
-}
-
-/// What was done, for programs; people are told in words.
-fn told(what: &serde_json::Value, out: &Out) {
-    if matches!(out.format, Format::Json | Format::Jsonl) {
-        out.line(&what.to_string());
-    }
 }
 
 fn build_one(folder: &Path, into: &Path, out: &Out) -> Result<(), Exit> {
@@ -275,21 +268,6 @@ fn build_one(folder: &Path, into: &Path, out: &Out) -> Result<(), Exit> {
     Ok(())
 }
 
-fn read_keys(paths: &[PathBuf]) -> Result<Vec<SecretKey>, Exit> {
-    Ok(paths.iter().map(|path| SecretKey::read(path)).collect::<Result<Vec<_>, _>>().map_err(Error::from)?)
-}
-
-/// A key of others by its file, secret or public. A file that is not there becomes a new secret key.
-fn public_key(path: &Path, out: &Out) -> Result<PublicKey, Exit> {
-    if !path.exists() {
-        let key = SecretKey::draw();
-        key.write(path).map_err(Error::from)?;
-        out.say(&format!("a new key, that only you can read: {}", path.display()));
-    }
-    let public = || SecretKey::read(path).map(|key| key.public());
-    Ok(PublicKey::read(path).or_else(|_| public()).map_err(Error::from)?)
-}
-
 fn rekey(by: &Path, keys: &[PathBuf], number: u64, into: &Path, out: &Out) -> Result<(), Exit> {
     let by = SecretKey::read(by).map_err(Error::from)?;
     let mut set = KeySet { number, keys: Vec::new() };
@@ -300,8 +278,8 @@ fn rekey(by: &Path, keys: &[PathBuf], number: u64, into: &Path, out: &Out) -> Re
     let written = midshift_durable::create(into, &envelope, midshift_durable::OPEN);
     written.map_err(|source| Error::Io { doing: "writing", path: into.to_owned(), source })?;
     let ids: Vec<String> = set.keys.iter().map(|key| key.id().to_string()).collect();
-    told(&serde_json::json!({"number": number, "keys": ids, "file": into}), out);
-    out.say(&format!("set {number} of directive keys in {}: it has no secrets", into.display()));
+    print_json(&serde_json::json!({"number": number, "keys": ids, "file": into}), out);
+    out.inform(&format!("set {number} of directive keys in {}: it has no secrets", into.display()));
     out.next(&format!("midshift bundle sign {} --repository REPOSITORY --key targets-1.pem", into.display()));
     Ok(())
 }
@@ -312,24 +290,6 @@ fn key_set(path: &Path) -> Result<Option<Vec<u8>>, Exit> {
         return Ok(None);
     }
     Ok(Some(bytes_of(path, ENVELOPE_BYTES_MAX)?))
-}
-
-/// The bytes of a file, and one more than `most` if it is longer.
-fn bytes_of(path: &Path, most: usize) -> Result<Vec<u8>, Exit> {
-    let mut bytes = Vec::new();
-    let read = File::open(path).and_then(|file| file.take(most as u64 + 1).read_to_end(&mut bytes));
-    read.map_err(|source| Error::Io { doing: "reading", path: path.to_owned(), source })?;
-    Ok(bytes)
-}
-
-/// Signed documents and bare signatures that others handed over.
-fn handed(paths: &[PathBuf]) -> Result<Vec<Vec<u8>>, Exit> {
-    let read = |path: &PathBuf| {
-        let bytes = bytes_of(path, SIGNED_DOCUMENT_BYTES)?;
-        let is_one = bytes.len() <= SIGNED_DOCUMENT_BYTES;
-        is_one.then_some(bytes).ok_or_else(|| Exit::usage(format!("{} is too long for a signature", path.display())))
-    };
-    paths.iter().map(read).collect()
 }
 
 /// What is signed.
@@ -363,20 +323,20 @@ fn withdraw(bundle: &str, repository: &Path, keys: &[PathBuf], out: &Out) -> Res
     let keys: Vec<&SecretKey> = keys.iter().collect();
     let (withdrawn, signed) = Folder::open(repository)?.withdraw(bundle, &keys, clock::wall())?;
     tell_signed(signed, repository, out);
-    out.say(&format!("{} {} is in no release any more once that is pushed", withdrawn.name, withdrawn.version));
+    out.inform(&format!("{} {} is in no release any more once that is pushed", withdrawn.name, withdrawn.version));
     Ok(())
 }
 
 fn tell_signed(signed: Signed, repository: &Path, out: &Out) {
     match signed {
         Signed::Published(version) => {
-            told(&serde_json::json!({"targetsVersion": version}), out);
-            out.say(&format!("signed: metadata/{version}.targets.json"));
+            print_json(&serde_json::json!({"targetsVersion": version}), out);
+            out.inform(&format!("signed: metadata/{version}.targets.json"));
             out.next(&format!("midshift bundle verify {}", repository.display()));
         }
         Signed::Pending => {
-            told(&serde_json::json!({"pending": true}), out);
-            out.say("not enough signatures yet: metadata/pending.targets.json waits for another person");
+            print_json(&serde_json::json!({"pending": true}), out);
+            out.inform("not enough signatures yet: metadata/pending.targets.json waits for another person");
             out.next(&format!("midshift bundle sign --pending --repository {} --key KEY", repository.display()));
         }
     }
@@ -398,7 +358,7 @@ fn samples(dir: &Path, program: Option<&Path>, signer: Signer<'_>, out: &Out) ->
             let rows: Vec<_> = made.bundles.iter().map(row).collect();
             out.line(super::out::columns(&["BUNDLE", "VERSION", "WHAT IT DOES"], &rows).trim_end());
             if let Some(keys) = &made.keys {
-                out.say(&format!("throw-away keys in {}: never use them in earnest", keys.display()));
+                out.inform(&format!("throw-away keys in {}: never use them in earnest", keys.display()));
             }
             out.next(&format!("midshift bundle push {}", made.repository.display()));
         }
@@ -419,10 +379,13 @@ fn verify(repository: &Path, out: &Out) -> Result<(), Exit> {
             let rows: Vec<Vec<String>> = checked.bundles.iter().map(row).collect();
             out.line(super::out::columns(&["BUNDLE", "VERSION", "COMPONENTS", "BYTES", "HARDWARE"], &rows).trim_end());
             let targets = checked.targets_version.map_or("none".to_owned(), |v| v.to_string());
-            out.say(&format!("root {}, targets {targets}: every signature and every file holds", checked.root_version));
+            out.inform(&format!(
+                "root {}, targets {targets}: every signature and every file holds",
+                checked.root_version
+            ));
             if let Some(set) = &checked.key_set {
                 let keys: Vec<String> = set.keys.iter().map(|key| key.id().to_string()).collect();
-                out.say(&format!("directive keys: set {}, {}", set.number, keys.join(" ")));
+                out.inform(&format!("directive keys: set {}, {}", set.number, keys.join(" ")));
             }
             out.next(&format!("midshift bundle push {}", repository.display()));
         }

@@ -1,13 +1,13 @@
 //! Calls of the command line: which server, what an error means for a person and for the exit code.
 
-use crate::contexts::{Contexts, Unknown};
+pub use crate::exit::{Exit, was_cut};
+
+use crate::contexts::Contexts;
 use crate::door::Found;
+use crate::endpoint::{Endpoint, Line};
+use crate::exit::{NO_SERVER, has_broken_off};
 use crate::out::Out;
 use crate::site_answer::SiteAnswer;
-use crate::way::{Line, Way};
-use midshift_bundle::build;
-use midshift_bundle::folder::Error;
-use midshift_core::reason::{self, Kind, Refusal};
 use midshift_proto::convert::time_of;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::identity::v1::audit_service_client::AuditServiceClient;
@@ -17,41 +17,25 @@ use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use midshift_proto::sim::v1::sim_service_client::SimServiceClient;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
-use std::io::ErrorKind;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::time::Duration;
 use tokio::time::Instant;
-use tonic::{Code, Request, Status, Streaming};
+use tonic::{Request, Streaming};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
 
+/// Every robot of a site in one message.
+pub const ANSWER_BYTES_MAX: usize = 64 * 1024 * 1024;
 /// Longest unary call.
 const CALL_WITHIN: Duration = Duration::from_secs(30);
 /// A server that says nothing for so long on a new connection hangs, or is none.
 const SAID_WITHIN: Duration = Duration::from_secs(5);
-/// Exit code of a server that is not there.
-const NO_SERVER: u8 = 5;
-/// Exit code of what nobody reads any more, as of a program that SIGPIPE has ended.
-const UNREAD: u8 = 141;
 /// A server that is gone while something is followed may stay away so long.
 const AWAY_MAX: Duration = Duration::from_secs(600);
 /// Pauses between looks for it.
 const PAUSE_MIN: Duration = Duration::from_millis(250);
 const PAUSE_MAX: Duration = Duration::from_secs(5);
-
-/// What a server says to a call that it does not know.
-const NOT_THERE: &str = "this server does not know the call\n  try: look at the port: stops are at 7421, everything else is at 7420. Faults and worlds are with `midshift dev` or \
-     `midshift sim run --listen`; for anything else look at the server's version";
-
-/// What is said of a server that takes a call and does not answer.
-const LATE: &str = "the server took the connection and has not answered in time\n  try: look at that process: it may hang, or be no midshift at all. What was asked may have been done: ask \
-     again with the same --request-id";
-
-/// What a connection says that ended before anything was answered.
-const BROKE_OFF: &str = "the server broke the connection off before it answered\n  try: sign in, if it speaks TLS: midshift login SERVER --pin DIGEST, with the \
-     digest that it printed at its first start";
 
 /// Which server, and as whom.
 #[derive(Clone, Debug, clap::Args)]
@@ -138,15 +122,15 @@ impl Resolved {
     }
     /// What the server says of its site; none: it does not answer, or says nothing. Waits for as long as a call may take.
     pub async fn site(&self) -> Option<SiteAnswer> {
-        site_of(self.way(&self.server).ok()?.connect().await.ok()?).await
+        site_of(self.endpoint(&self.server).ok()?.connect().await.ok()?).await
     }
-    /// The way to `address` of this site.
-    pub fn way(&self, address: &str) -> Result<Way, Exit> {
-        let way = match &self.authority_pem {
-            Some(root) => Way::secure(address, root, self.token.as_deref()),
-            None => Way::plain(address),
+    /// The endpoint at `address` of this site.
+    pub fn endpoint(&self, address: &str) -> Result<Endpoint, Exit> {
+        let endpoint = match &self.authority_pem {
+            Some(root) => Endpoint::secure(address, root, self.token.as_deref()),
+            None => Endpoint::plain(address),
         };
-        way.map_err(|error| Exit::usage(format!("{error:#}")))
+        endpoint.map_err(|error| Exit::usage(format!("{error:#}")))
     }
 }
 
@@ -154,172 +138,6 @@ impl Resolved {
 pub async fn site_of(line: Line) -> Option<SiteAnswer> {
     let answer = HealthClient::new(line).check(unary(HealthCheckRequest::default())).await.ok()?;
     SiteAnswer::read(answer.metadata())
-}
-
-/// An end that is not success.
-#[derive(Debug)]
-pub struct Exit {
-    code: u8,
-    text: String,
-    remedy: Remedy,
-}
-
-/// What a program may do about an end that is not success.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Remedy {
-    /// Nothing: a person must.
-    None,
-    /// The same again later.
-    Later,
-    /// The same from the beginning: the server does not know any more where it was.
-    Anew,
-}
-
-impl Exit {
-    /// With a code of the list in docs/cli.md.
-    pub fn new(code: u8, text: impl Into<String>) -> Self {
-        let remedy = if code == NO_SERVER { Remedy::Later } else { Remedy::None };
-        Self { code, text: text.into(), remedy }
-    }
-    /// What was heard cannot be written. If nobody reads any more there is nobody to tell either, and the end is that of a program that wrote into a closed pipe.
-    fn unwritten(why: ErrorKind) -> Self {
-        match why {
-            ErrorKind::BrokenPipe => Self::new(UNREAD, ""),
-            other => Self::new(1, format!("writing what was heard: {other}")),
-        }
-    }
-    /// The server does not know the place any more from which it was to go on.
-    pub fn is_of_a_lost_place(&self) -> bool {
-        self.remedy == Remedy::Anew
-    }
-    /// Bad arguments.
-    pub fn usage(text: impl Into<String>) -> Self {
-        Self::new(2, text)
-    }
-    /// The code.
-    pub fn code(&self) -> u8 {
-        self.code
-    }
-    /// The same end with the facts that the server sent beside its sentence: which roll-out, how many robots for which reason.
-    pub fn with_facts(status: Status) -> Self {
-        let facts = midshift_proto::refusal_of(&status).metadata;
-        let mut exit = Self::from(status);
-        let told: String = facts.iter().map(|(key, value)| format!("\n  {key}: {value}")).collect();
-        let at = exit.text.find("\n  try: ").unwrap_or(exit.text.len());
-        exit.text.insert_str(at, &told);
-        exit
-    }
-    /// The same end with one more thing to try.
-    pub fn or_try(mut self, what: &str) -> Self {
-        self.text += &format!("\n  try: {what}");
-        self
-    }
-    /// What was looked at does not hold: a finding, not a mistake of the caller.
-    pub fn of_finding(error: Error) -> Self {
-        match error {
-            Error::Refused(refusal) | Error::Bundle(build::Error::Refused(refusal)) => {
-                let lines = refusal.violations.iter().map(|v| format!("\n  {}: {}", v.field, v.description));
-                Self::new(1, format!("it does not hold:{}", lines.collect::<String>()))
-            }
-            other => other.into(),
-        }
-    }
-    /// Says why and gives the code.
-    pub fn report(&self, out: &Out) -> ExitCode {
-        if self.code != UNREAD {
-            out.say(&format!("error: {}", self.text));
-        }
-        ExitCode::from(self.code)
-    }
-}
-
-/// What was asked breaks rules, or could not be done.
-impl From<Error> for Exit {
-    fn from(error: Error) -> Self {
-        match error {
-            Error::Refused(refusal) | Error::Bundle(build::Error::Refused(refusal)) => {
-                anyhow::Error::from(refusal).into()
-            }
-            other => Self::new(1, other.to_string()),
-        }
-    }
-}
-
-impl From<Unknown> for Exit {
-    fn from(Unknown(name): Unknown) -> Self {
-        Self::new(4, format!("no context {name}\n  try: midshift context ls, or midshift login"))
-    }
-}
-
-impl std::fmt::Display for Exit {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(&self.text)
-    }
-}
-
-impl From<anyhow::Error> for Exit {
-    fn from(error: anyhow::Error) -> Self {
-        if let Some(refusal) = error.downcast_ref::<Refusal>().filter(|r| r.kind() == Kind::Invalid) {
-            let violations = refusal.violations.iter().map(|v| (v.field.as_str(), v.description.as_str()));
-            return Self::new(2, broken_rules(violations).unwrap_or_else(|| refusal.to_string()));
-        }
-        match error.downcast::<Status>() {
-            Ok(status) => status.into(),
-            Err(error) => Self::new(1, format!("{error:#}")),
-        }
-    }
-}
-
-/// Each rule that a request breaks, on a line of its own; none of none.
-fn broken_rules<'a>(violations: impl ExactSizeIterator<Item = (&'a str, &'a str)>) -> Option<String> {
-    let headline = match violations.len() {
-        0 => return None,
-        1 => "the request breaks a rule".to_owned(),
-        rules => format!("the request breaks {rules} rules"),
-    };
-    Some(violations.fold(headline, |text, (field, description)| format!("{text}\n  {field}: {description}")))
-}
-
-impl From<Status> for Exit {
-    fn from(status: Status) -> Self {
-        let answer = midshift_proto::refusal_of(&status);
-        let code = match status.code() {
-            Code::InvalidArgument | Code::OutOfRange => 2,
-            Code::NotFound => 4,
-            Code::Unavailable | Code::Unimplemented => NO_SERVER,
-            Code::PermissionDenied | Code::Unauthenticated => 6,
-            Code::Aborted | Code::AlreadyExists | Code::FailedPrecondition => 9,
-            Code::DeadlineExceeded => 10,
-            _ if is_late(&status) => 10,
-            _ if has_broken_off(&status) => NO_SERVER,
-            _ => 1,
-        };
-        let violations = answer.violations.iter().map(|v| (v.field.as_str(), v.description.as_str()));
-        let mut text = broken_rules(violations).unwrap_or_else(|| match status.message() {
-            _ if status.code() == Code::Unimplemented => NOT_THERE.to_owned(),
-            _ if is_late(&status) => LATE.to_owned(),
-            _ if has_broken_off(&status) => BROKE_OFF.to_owned(),
-            "" => status.code().to_string(),
-            message => message.to_owned(),
-        });
-        // A broken rule says by itself what to mend.
-        let next_step = answer.code.filter(|_| answer.violations.is_empty()).map_or("", reason::Code::next_step);
-        // The help of a code ends with it.
-        let told = text.strip_suffix(next_step).unwrap_or(&text).trim_end().len();
-        text.truncate(told);
-        if answer.code == Some(reason::Code::Internal) && !answer.request_id.is_empty() {
-            text += &format!("\n  request_id: {}", answer.request_id);
-        }
-        if !next_step.is_empty() {
-            text += &format!("\n  try: {next_step}");
-        }
-        let remedy = match answer.code {
-            Some(reason::Code::CursorExpired | reason::Code::CursorOfOtherStore) => Remedy::Anew,
-            _ if was_cut(&status) || status.code() == Code::ResourceExhausted => Remedy::Later,
-            _ => Remedy::None,
-        };
-        Self { code, text, remedy }
-    }
 }
 
 /// Takes the messages of a stream until `take` breaks, through restarts of the server: a stream that was cut is opened again, and says
@@ -355,27 +173,11 @@ pub async fn follow<T, B>(
         if is_cut {
             away = away.filter(|away| !away.is_over());
             if away.is_none() {
-                out.say("the server ended the stream; waiting until it is back");
+                out.inform("the server ended the stream; waiting until it is back");
             }
             stream = away.get_or_insert_with(Away::begin).again(&open, &why).await?;
         }
     }
-}
-
-/// The server took the call and has not answered: the deadline was this program's own.
-fn is_late(status: &Status) -> bool {
-    status.code() == Code::Cancelled && status.message() == "Timeout expired"
-}
-
-/// What plain text hears of a port that speaks TLS.
-fn has_broken_off(status: &Status) -> bool {
-    let said = status.message();
-    said.starts_with("h2 protocol error") || ["operation was canceled", "transport error"].contains(&said)
-}
-
-/// The connection is gone, and with it what the answer would have been.
-pub fn was_cut(status: &Status) -> bool {
-    matches!(status.code(), Code::Unavailable | Code::Unknown | Code::Cancelled | Code::Internal)
 }
 
 /// A server that is gone while something is followed.
@@ -407,7 +209,7 @@ impl Away {
             tokio::time::sleep(self.pause).await;
             self.pause = (self.pause * 2).min(PAUSE_MAX);
             match open().await {
-                Err(exit) if exit.remedy == Remedy::Later && self.begun.elapsed() < AWAY_MAX => {}
+                Err(exit) if exit.may_pass() && self.begun.elapsed() < AWAY_MAX => {}
                 Ok(_) if self.answered.is_some() && self.begun.elapsed() >= AWAY_MAX => {
                     let text = format!("the server has ended each stream at once for {AWAY_MAX:?}: {why}");
                     return Err(Exit::new(NO_SERVER, text));
@@ -440,57 +242,56 @@ impl Call {
     /// A channel that stands.
     pub async fn line(&self) -> Result<Line, Exit> {
         let resolved = self.resolved()?;
-        let way = resolved.way(&resolved.server)?;
-        let line = way.connect().await.map_err(|error| no_server(&resolved, &*error.0))?;
+        let endpoint = resolved.endpoint(&resolved.server)?;
+        let line = endpoint.connect().await.map_err(|error| no_server(&resolved, &*error.0))?;
         if !resolved.is_secure() {
-            answers(&way, line.clone()).await.map_err(|found| at_wrong_door(&resolved, found))?;
+            answers(&endpoint, line.clone()).await.map_err(|found| at_wrong_door(&resolved, found))?;
         }
         Ok(line)
     }
-    /// Who is who.
-    pub async fn identity(&self) -> Result<IdentityServiceClient<Line>, Exit> {
-        Ok(IdentityServiceClient::new(self.line().await?))
-    }
-    /// Task intake.
-    pub async fn task(&self) -> Result<TaskServiceClient<Line>, Exit> {
-        Ok(TaskServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
-    }
-    /// Connects to the service of fleet.
-    pub async fn fleet(&self) -> Result<FleetServiceClient<Line>, Exit> {
-        Ok(FleetServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
-    }
-    /// Connects to the service of telemetry.
-    pub async fn telemetry(&self) -> Result<TelemetryServiceClient<Line>, Exit> {
-        Ok(TelemetryServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
-    }
-    /// Releases of software.
-    pub async fn bundles(&self) -> Result<BundleServiceClient<Line>, Exit> {
-        Ok(BundleServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
-    }
-    /// Roll-outs of software.
-    pub async fn rollouts(&self) -> Result<RolloutServiceClient<Line>, Exit> {
-        Ok(RolloutServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
-    }
-    /// Who decided what.
-    pub async fn audit(&self) -> Result<AuditServiceClient<Line>, Exit> {
-        Ok(AuditServiceClient::new(self.line().await?).max_decoding_message_size(64 * 1024 * 1024))
-    }
-    /// Whether it serves.
-    pub async fn health(&self) -> Result<HealthClient<Line>, Exit> {
-        Ok(HealthClient::new(self.line().await?))
-    }
-    /// Faults of the simulator.
-    pub async fn sim(&self) -> Result<SimServiceClient<Line>, Exit> {
-        Ok(SimServiceClient::new(self.line().await?))
-    }
+}
+
+macro_rules! services {
+    ($($(#[$doc:meta])* $name:ident: $client:ident)*) => {
+        impl Call { $(
+            $(#[$doc])*
+            ///
+            /// # Errors
+            /// No server of the site answers.
+            pub async fn $name(&self) -> Result<$client<Line>, Exit> {
+                Ok($client::new(self.line().await?).max_decoding_message_size(ANSWER_BYTES_MAX))
+            }
+        )* }
+    };
+}
+
+services! {
+    /// Asks who is who.
+    identity: IdentityServiceClient
+    /// Asks who decided what.
+    audit: AuditServiceClient
+    /// Asks the intake of tasks.
+    task: TaskServiceClient
+    /// Asks what is decided about robots and places.
+    fleet: FleetServiceClient
+    /// Asks what robots said.
+    telemetry: TelemetryServiceClient
+    /// Asks for releases of software.
+    bundles: BundleServiceClient
+    /// Asks for roll-outs of software.
+    rollouts: RolloutServiceClient
+    /// Asks whether it serves.
+    health: HealthClient
+    /// Asks simulated robots.
+    sim: SimServiceClient
 }
 
 /// Waits for any answer. In plain text a connection stands as soon as the system has taken it, whether a program looks at it or not.
-async fn answers(way: &Way, line: Line) -> Result<(), Found> {
+async fn answers(endpoint: &Endpoint, line: Line) -> Result<(), Found> {
     let mut health = HealthClient::new(line);
     match tokio::time::timeout(SAID_WITHIN, health.check(HealthCheckRequest::default())).await {
         Err(_) => Err(Found::Silence),
-        Ok(Err(status)) if has_broken_off(&status) => match Found::by_probe(way).await {
+        Ok(Err(status)) if has_broken_off(&status) => match Found::by_probe(endpoint).await {
             Found::Unknown => Ok(()),
             found => Err(found),
         },
@@ -539,7 +340,7 @@ pub fn done_before(at: Option<&prost_types::Timestamp>, change: DryRun) -> Optio
 /// Says how a command ended that takes a request_id: that it was done before, that it would be done, or what comes `next`, if anything.
 pub fn ended(done: Option<&prost_types::Timestamp>, change: DryRun, next: &str, out: &Out) {
     match (done_before(done, change), change) {
-        (Some(told), _) => out.say(&told),
+        (Some(told), _) => out.inform(&told),
         (None, DryRun::Yes) => out.next(WOULD),
         (None, DryRun::No) if next.is_empty() => {}
         (None, DryRun::No) => out.next(next),
@@ -566,6 +367,17 @@ pub struct Change {
     pub request_id: String,
 }
 
+/// What every verb takes that changes something which has an etag.
+#[derive(Clone, Debug, clap::Args)]
+pub struct Guarded {
+    /// Only if it is still as this etag says.
+    #[arg(long, default_value = "")]
+    pub if_match: String,
+    /// As of every change.
+    #[command(flatten)]
+    pub change: Change,
+}
+
 impl Change {
     /// Whether it is only checked.
     pub fn only(&self) -> DryRun {
@@ -577,6 +389,7 @@ impl Change {
 mod tests {
     use super::*;
     use tokio_stream::StreamExt;
+    use tonic::Status;
     use tonic::codec::{DecodeBuf, Decoder};
 
     /// Streams without a message.
@@ -588,48 +401,6 @@ mod tests {
         fn decode(&mut self, _: &mut DecodeBuf<'_>) -> Result<Option<()>, Status> {
             Ok(None)
         }
-    }
-
-    #[test]
-    fn what_may_pass_is_waited_for_and_a_lost_place_is_begun_anew() {
-        for code in [Code::Unavailable, Code::Unknown, Code::Internal, Code::Cancelled, Code::ResourceExhausted] {
-            assert_eq!(Exit::from(Status::new(code, "")).remedy, Remedy::Later, "{code:?}");
-        }
-        for code in [Code::PermissionDenied, Code::Unauthenticated, Code::InvalidArgument, Code::NotFound] {
-            assert_eq!(Exit::from(Status::new(code, "")).remedy, Remedy::None, "{code:?}");
-        }
-        for code in [reason::Code::CursorExpired, reason::Code::CursorOfOtherStore] {
-            let refusal = Refusal::new(Kind::Precondition, code);
-            assert!(Exit::from(midshift_proto::status(&refusal, None)).is_of_a_lost_place(), "{code:?}");
-        }
-    }
-
-    #[test]
-    fn an_error_says_what_it_means_and_then_what_to_try() {
-        let told = |kind, reason: reason::Reason| {
-            Exit::from(midshift_proto::status(&Refusal::new(kind, reason), Some("r-77"))).to_string()
-        };
-        let nobody = told(Kind::NotFound, reason::Code::RobotNotFound.into());
-        assert_eq!(nobody, format!("No robot has this id.\n  try: {}", reason::Code::RobotNotFound.next_step()));
-        let own = told(Kind::Denied, reason::Reason::new(reason::Code::NotPermitted, "it takes the role viewer"));
-        assert_eq!(own, format!("it takes the role viewer\n  try: {}", reason::Code::NotPermitted.next_step()));
-        let fault = told(Kind::Internal, reason::Code::Internal.into());
-        assert_eq!(
-            fault,
-            "A fault of midshift.\n  request_id: r-77\n  try: Look for the request_id in the server's log."
-        );
-    }
-
-    #[test]
-    fn a_server_that_does_not_answer_in_time_and_a_port_that_speaks_tls_have_their_own_words_and_exit_codes() {
-        let late = Exit::from(Status::cancelled("Timeout expired"));
-        assert_eq!((late.code(), late.to_string()), (10, LATE.to_owned()));
-        for message in ["h2 protocol error: http2 error", "operation was canceled"] {
-            let broken = Exit::from(Status::unknown(message));
-            assert_eq!((broken.code(), broken.to_string()), (NO_SERVER, BROKE_OFF.to_owned()));
-        }
-        let canceled = Exit::from(Status::cancelled("by whoever asked"));
-        assert_eq!((canceled.code(), canceled.to_string().as_str()), (1, "by whoever asked"));
     }
 
     #[tokio::test(start_paused = true)]

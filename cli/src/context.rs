@@ -6,7 +6,7 @@ use super::client::{Call, Exit, site_of, unary};
 use super::contexts::{Context, Contexts, Unknown};
 use super::door::Found;
 use super::out::Out;
-use crate::way::Way;
+use crate::endpoint::Endpoint;
 use anyhow::Context as _;
 use clap::{Args, Subcommand};
 use console::Term;
@@ -72,7 +72,7 @@ fn token(file: Option<&PathBuf>, out: &Out) -> Result<String, Exit> {
         return Ok(token.trim().to_owned());
     }
     if std::io::stdin().is_terminal() {
-        out.say("The token, then Enter (it is not shown):");
+        out.inform("The token, then Enter (it is not shown):");
         let line = Term::stderr().read_secure_line().context("reading the token")?;
         if line.trim().is_empty() {
             return Err(Exit::usage("no token was typed; --token-file and MIDSHIFT_TOKEN need no terminal"));
@@ -94,8 +94,8 @@ pub async fn login(args: Login, out: &Out) -> Result<(), Exit> {
         (None, None) => return Err(Exit::usage("--pin or --ca says which site this is")),
     };
     let token = token(args.token_file.as_ref(), out)?;
-    let way = Way::secure(&args.server, &authority_pem, Some(&token))?;
-    let line = way.connect().await.map_err(|error| no_server(&args.server, &error))?;
+    let endpoint = Endpoint::secure(&args.server, &authority_pem, Some(&token))?;
+    let line = endpoint.connect().await.map_err(|error| no_server(&args.server, &error))?;
     let me = IdentityServiceClient::new(line.clone()).who_am_i(unary(WhoAmIRequest {})).await?.into_inner();
     let mut contexts = Contexts::read()?;
     let stop_server = match args.stop_server {
@@ -107,7 +107,7 @@ pub async fn login(args: Login, out: &Out) -> Result<(), Exit> {
     contexts.context.insert(args.name.clone(), context);
     contexts.current = Some(args.name.clone());
     contexts.write()?;
-    out.say(&format!(
+    out.inform(&format!(
         "signed in to {} as {} ({}), remembered as {}",
         me.site_id,
         me.actor,

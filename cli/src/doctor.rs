@@ -1,5 +1,6 @@
 //! `midshift doctor`: looks for what may be wrong, and says what to try.
 
+mod finding;
 mod machine;
 mod shown;
 mod site;
@@ -8,9 +9,10 @@ mod stop;
 use super::client::{Call, Exit, unary};
 use super::out::{Format, Out, columns};
 use super::released;
+use crate::endpoint::Line;
 use crate::roles::Role;
-use crate::way::Line;
 use crate::{clock, site_answer};
+use finding::{DAY_MS, Finding};
 use midshift_bundle::freshness::{newest_targets, root_edition, stamp, targets_edition};
 use midshift_bundle::repository::TIMESTAMP_LIFE_MS;
 use midshift_core::time::Utc;
@@ -35,9 +37,6 @@ const TIMESTAMP_LEFT_MS: u64 = TIMESTAMP_LIFE_MS / 4;
 const FULL_PERCENT: u64 = 90;
 /// Root documents that are followed, one after the other, as robots do.
 const ROOTS_MAX: u64 = 1_024;
-/// Milliseconds of a day.
-const DAY_MS: u64 = 24 * 3_600_000;
-
 /// What to look at.
 #[derive(Clone, Debug, clap::Args)]
 pub struct Doctor {
@@ -54,28 +53,11 @@ pub struct Doctor {
     accept_clock: bool,
 }
 
-#[derive(Debug)]
-struct Finding {
-    what: &'static str,
-    good: bool,
-    text: String,
-}
-
-impl Finding {
-    fn good(what: &'static str, text: impl Into<String>) -> Self {
-        Self { what, good: true, text: text.into() }
-    }
-    /// A person should look into it.
-    fn look(what: &'static str, text: impl Into<String>) -> Self {
-        Self { what, good: false, text: text.into() }
-    }
-}
-
 /// Runs every check; exit code 1 if one is not good.
 pub async fn run(doctor: &Doctor, out: &Out) -> Result<(), Exit> {
     if doctor.accept_clock {
         clock::leave_word(&doctor.data)?;
-        out.say("the server of that folder takes the clock of this machine for right, within seconds");
+        out.inform("the server of that folder takes the clock of this machine for right, within seconds");
         out.next("midshift doctor");
         return Ok(());
     }
@@ -85,7 +67,7 @@ pub async fn run(doctor: &Doctor, out: &Out) -> Result<(), Exit> {
         Err(_) => {
             found.extend(machine::descriptors(&doctor.data, None));
             let at = doctor.call.address()?;
-            found.push(Finding::look(
+            found.push(Finding::wants_look(
                 "server",
                 format!("nothing answers at {at}; start `midshift dev` or `midshift serve`"),
             ));
@@ -136,7 +118,7 @@ async fn server(doctor: &Doctor, found: &mut Vec<Finding>) -> Result<(), Exit> {
     found.extend(site::identities(call, &resolved, now).await);
     found.push(site::exposure(&resolved));
     let address = super::stop::address(doctor.stop_server.as_deref(), &resolved)?;
-    found.extend(stop::look(&resolved, &address, now, &online).await);
+    found.extend(stop::check_stop_service(&resolved, &address, now, &online).await);
     Ok(())
 }
 
@@ -302,7 +284,7 @@ fn clocks(robots: &[v1::Robot]) -> Finding {
     let text = format!("{count} robots off by more than {SKEW_MAX_MS} ms");
     match skewed.max_by_key(|robot| offset(robot).abs()) {
         None => Finding::good("clocks", text),
-        Some(worst) => Finding::look(
+        Some(worst) => Finding::wants_look(
             "clocks",
             format!("{text}, most of all {} by {} ms: set them from the network (NTP)", worst.robot_id, offset(worst)),
         ),

@@ -1,6 +1,6 @@
 //! Says what was found at an address where no server of the site answers, by what the connection has said.
 
-use crate::way::Way;
+use crate::endpoint::Endpoint;
 use std::error::Error;
 use std::io::ErrorKind;
 use std::iter::successors;
@@ -52,9 +52,9 @@ impl Found {
     }
 
     /// What a server in plain text is that broke a call of gRPC off, by its first words to a request of HTTP/1.1.
-    pub async fn by_probe(way: &Way) -> Self {
+    pub async fn by_probe(endpoint: &Endpoint) -> Self {
         let probe = async {
-            let mut wire = way.wire().await?;
+            let mut wire = endpoint.wire().await?;
             wire.write_all(b"GET / HTTP/1.1\r\nhost: midshift\r\nconnection: close\r\n\r\n").await?;
             let mut said = [0; 5];
             wire.read_exact(&mut said).await?;
@@ -110,8 +110,8 @@ mod tests {
 
     async fn found_over_tls(address: std::net::SocketAddr) -> Found {
         let root = rcgen::generate_simple_self_signed(["midshift".to_owned()]).expect("a root").cert.pem();
-        let way = Way::secure(&address.to_string(), &root, None).expect("a way");
-        Found::by(&*way.connect().await.expect_err("no server of the site").0)
+        let endpoint = Endpoint::secure(&address.to_string(), &root, None).expect("an endpoint");
+        Found::by(&*endpoint.connect().await.expect_err("no server of the site").0)
     }
 
     #[tokio::test]

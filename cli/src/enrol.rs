@@ -3,6 +3,7 @@
 use super::client::{Call, Exit, unary};
 use super::lookup::{self, Found, whole_id};
 use super::out::Out;
+use super::pages::{self, Listed, PAGE_SIZE};
 use crate::stop_service;
 use midshift_agent::program::ENROLL;
 use midshift_core::site::{self, text};
@@ -40,13 +41,13 @@ pub async fn offer(machine: Machine, replace: bool, out: &Out) -> Result<(), Exi
     out.one(&offered, &offered.secret, line)?;
     let other_site = said.map(|said| said.site_id).filter(|site_id| machine.site.is_none() && !is_demo(site_id));
     if let Some(site_id) = other_site {
-        out.say(&format!(
+        out.inform(&format!(
             "warning: a simulated body lives on the built-in demo site, and this one is {site_id}; --site FILE puts its file into the line"
         ));
     }
     let until = offered.expire_time.as_ref().map_or_else(String::new, |time| time_of(time).rfc3339());
     if is_loopback(&server) {
-        out.say(&format!(
+        out.inform(&format!(
             "warning: {server} is this machine; on another one put an address there under which it finds the server"
         ));
     }
@@ -117,7 +118,7 @@ async fn find(call: &Call, typed: &str) -> Result<String, Exit> {
         let (page_size, robot_id_prefix) = (lookup::SHOWN, typed.to_owned());
         let request = v1::ListRobotIdentitiesRequest { page_size, robot_id_prefix, page_token: String::new() };
         let page = client.list_robot_identities(unary(request)).await?.into_inner();
-        Ok(Found::page(&page.robots, &page.next_page_token, |r| &r.robot_id, |robot| vec![state(robot)]))
+        Ok(Found::page(&page, |robot| vec![state(robot)]))
     };
     whole_id("robot", typed, listed).await
 }
@@ -135,22 +136,24 @@ fn state(robot: &v1::RobotIdentity) -> String {
 /// Lists who is enrolled.
 pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
     let mut client = call.identity().await?;
-    let mut asked = v1::ListRobotIdentitiesRequest { page_size: 1_000, ..Default::default() };
-    let mut all = v1::ListRobotIdentitiesResponse::default();
-    loop {
-        let page = client.list_robot_identities(unary(asked.clone())).await?.into_inner();
-        all.robots.extend(page.robots);
-        if page.next_page_token.is_empty() {
-            break;
-        }
-        asked.page_token = page.next_page_token;
-    }
-    let at =
-        |time: &Option<prost_types::Timestamp>| time.as_ref().map_or_else(|| "-".to_owned(), |t| time_of(t).rfc3339());
-    let row = |robot: &v1::RobotIdentity| {
-        vec![robot.robot_id.clone(), state(robot), at(&robot.enrol_time), at(&robot.expire_time)]
+    let read = async |page_token| {
+        let request = v1::ListRobotIdentitiesRequest { page_size: PAGE_SIZE, page_token, ..Default::default() };
+        client.list_robot_identities(unary(request)).await
     };
-    Ok(out.many(&all, &all.robots, |r| r.robot_id.clone(), &["ROBOT", "STATE", "SINCE", "CERTIFICATE UNTIL"], row)?)
+    Ok(out.list(&pages::all(read).await?)?)
+}
+
+impl Listed for v1::RobotIdentity {
+    const HEADER: &'static [&'static str] = &["ROBOT", "STATE", "SINCE", "CERTIFICATE UNTIL"];
+    fn name(&self) -> String {
+        self.robot_id.clone()
+    }
+    fn row(&self) -> Vec<String> {
+        let at = |time: &Option<prost_types::Timestamp>| {
+            time.as_ref().map_or_else(|| "-".to_owned(), |t| time_of(t).rfc3339())
+        };
+        vec![self.robot_id.clone(), state(self), at(&self.enrol_time), at(&self.expire_time)]
+    }
 }
 
 #[cfg(test)]

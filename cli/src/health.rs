@@ -63,8 +63,8 @@ async fn serving(call: &Call, service: String) -> Result<&'static str, String> {
 
 async fn ready(resolved: &Resolved) -> Result<&'static str, String> {
     let failed = |error: std::io::Error| error.to_string();
-    let way = resolved.way(&resolved.server).map_err(|exit| exit.to_string())?;
-    let mut stream = way.wire().await.map_err(failed)?;
+    let endpoint = resolved.endpoint(&resolved.server).map_err(|exit| exit.to_string())?;
+    let mut stream = endpoint.wire().await.map_err(failed)?;
     let request = format!("GET /ready HTTP/1.1\r\nHost: {}\r\nConnection: close\r\n\r\n", resolved.server);
     stream.write_all(request.as_bytes()).await.map_err(failed)?;
     let mut line = String::new();

@@ -3,6 +3,7 @@
 use super::client::{Call, Change, Exit, unary};
 use super::lookup::{self, Found, whole_id};
 use super::out::{Out, plain};
+use super::pages::{self, Listed, PAGE_SIZE};
 use clap::Subcommand;
 use midshift_proto::convert::time_of;
 use midshift_proto::fleet::v1;
@@ -50,25 +51,16 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
         Verb::Ls { call, all, robot } => {
             let mut client = call.fleet().await?;
-            let mut whole = v1::ListIncidentsResponse::default();
-            loop {
-                let request = v1::ListIncidentsRequest {
-                    include_closed: all,
-                    robot_id: robot.clone(),
-                    page_size: 1_000,
-                    page_token: whole.next_page_token.clone(),
-                    incident_id_prefix: String::new(),
-                };
-                let page = client.list_incidents(unary(request)).await?.into_inner();
-                whole.incidents.extend(page.incidents);
-                whole.next_page_token = page.next_page_token;
-                if whole.next_page_token.is_empty() {
-                    break;
-                }
-            }
-            let header = ["OPENED", "CODE", "ABOUT", "CLOSED BY", "INCIDENT"];
-            out.many(&whole, &whole.incidents, |i| i.incident_id.clone(), &header, row)?;
-            Ok(())
+            let request = v1::ListIncidentsRequest {
+                include_closed: all,
+                robot_id: robot,
+                page_size: PAGE_SIZE,
+                ..v1::ListIncidentsRequest::default()
+            };
+            let read = async |page_token| {
+                client.list_incidents(unary(v1::ListIncidentsRequest { page_token, ..request.clone() })).await
+            };
+            Ok(out.list(&pages::all(read).await?)?)
         }
         Verb::Get { call, incident_id } => {
             let request = v1::GetIncidentRequest { incident_id: find(&call, &incident_id).await? };
@@ -100,7 +92,7 @@ async fn find(call: &Call, typed: &str) -> Result<String, Exit> {
             ..v1::ListIncidentsRequest::default()
         };
         let page = client.list_incidents(unary(request)).await?.into_inner();
-        Ok(Found::page(&page.incidents, &page.next_page_token, |i| &i.incident_id, row))
+        Ok(Found::page(&page, Listed::row))
     };
     whole_id("incident", typed, listed).await
 }
@@ -111,21 +103,27 @@ fn show(incident: &v1::Incident, out: &Out) -> Result<(), Exit> {
         let facts = incident.reason.iter().flat_map(|r| &r.metadata).collect::<std::collections::BTreeMap<_, _>>();
         let facts: String = facts.into_iter().map(|(key, value)| format!("\n  {key}: {}", plain(value))).collect();
         let closed = incident.closed.as_ref().map(|c| format!("\nclosed by {}: {}", plain(&c.actor), plain(&c.reason)));
-        format!("{}\n{reason}{facts}{}", row(incident).join("  "), closed.unwrap_or_default())
+        format!("{}\n{reason}{facts}{}", incident.row().join("  "), closed.unwrap_or_default())
     };
     out.one(incident, &incident.incident_id, text)?;
     Ok(())
 }
 
-fn row(incident: &v1::Incident) -> Vec<String> {
-    let fact = |key: &str| incident.reason.as_ref().and_then(|r| r.metadata.get(key)).cloned().unwrap_or_default();
-    let (rollout_id, place_id) = (fact("rollout_id"), fact("place_id"));
-    let about = [&incident.robot_id, &incident.task_id, &incident.area_id, &rollout_id, &place_id];
-    vec![
-        incident.open_time.as_ref().map(|t| time_of(t).rfc3339()).unwrap_or_default(),
-        incident.reason.as_ref().map(|r| r.code.clone()).unwrap_or_default(),
-        about.into_iter().filter(|id| !id.is_empty()).cloned().collect::<Vec<_>>().join(" "),
-        incident.closed.as_ref().map(|c| c.actor.clone()).unwrap_or_default(),
-        incident.incident_id.clone(),
-    ]
+impl Listed for v1::Incident {
+    const HEADER: &'static [&'static str] = &["OPENED", "CODE", "ABOUT", "CLOSED BY", "INCIDENT"];
+    fn name(&self) -> String {
+        self.incident_id.clone()
+    }
+    fn row(&self) -> Vec<String> {
+        let fact = |key: &str| self.reason.as_ref().and_then(|r| r.metadata.get(key)).cloned().unwrap_or_default();
+        let (rollout_id, place_id) = (fact("rollout_id"), fact("place_id"));
+        let about = [&self.robot_id, &self.task_id, &self.area_id, &rollout_id, &place_id];
+        vec![
+            self.open_time.as_ref().map(|t| time_of(t).rfc3339()).unwrap_or_default(),
+            self.reason.as_ref().map(|r| r.code.clone()).unwrap_or_default(),
+            about.into_iter().filter(|id| !id.is_empty()).cloned().collect::<Vec<_>>().join(" "),
+            self.closed.as_ref().map(|c| c.actor.clone()).unwrap_or_default(),
+            self.incident_id.clone(),
+        ]
+    }
 }

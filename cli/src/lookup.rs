@@ -3,6 +3,7 @@
 //! Invariant: a whole id is always itself, however many others begin with it.
 
 use super::client::Exit;
+use super::pages::{Listed, Page};
 use tonic::{Code, Status};
 
 /// Candidates that are asked for, and shown where they are several.
@@ -18,19 +19,19 @@ pub struct Found {
 }
 
 impl Found {
-    /// One page of a list, in the order of ids.
-    pub fn page<T>(
-        rows: &[T],
-        next_page_token: &str,
-        id: impl Fn(&T) -> &str,
-        row: impl Fn(&T) -> Vec<String>,
-    ) -> Self {
-        let candidate = |one: &T| {
-            let (id, mut words) = (id(one).to_owned(), row(one));
+    /// One page of a list, in the order of ids, with what is told of each.
+    pub fn page<P: Page<Item: Listed>>(page: &P, row: impl Fn(&P::Item) -> Vec<String>) -> Self {
+        let candidate = |one: &P::Item| (one.name(), row(one));
+        Self::new(page.items().iter().map(candidate), page.is_last())
+    }
+
+    /// Ids, each with what is told of it.
+    pub fn new(ids: impl IntoIterator<Item = (String, Vec<String>)>, is_all: bool) -> Self {
+        let candidate = |(id, mut words): (String, Vec<String>)| {
             words.retain(|word| *word != id && !word.is_empty());
             (id.clone(), [vec![id], words].concat().join("  "))
         };
-        Self { candidates: rows.iter().map(candidate).collect(), is_all: next_page_token.is_empty() }
+        Self { candidates: ids.into_iter().map(candidate).collect(), is_all }
     }
 
     /// The id that is meant; none: nothing begins with it.
@@ -81,7 +82,8 @@ mod tests {
     use super::*;
 
     fn found(ids: &[&str], next_page_token: &str) -> Found {
-        Found::page(ids, next_page_token, |id| id, |id| vec!["OPEN".to_owned(), (*id).to_owned(), String::new()])
+        let row = |id: &&str| ((*id).to_owned(), vec!["OPEN".to_owned(), (*id).to_owned(), String::new()]);
+        Found::new(ids.iter().map(row), next_page_token.is_empty())
     }
 
     #[test]

@@ -84,7 +84,7 @@ fn check(file: Option<&Path>, robots: Option<u64>, out: &Out) -> Result<(), Exit
             }
         }
     }
-    out.say(&format!(
+    out.inform(&format!(
         "{name}: {} waypoints, {} lanes, {} places, {} findings",
         site.waypoints().len(),
         site.lanes().len(),

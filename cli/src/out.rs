@@ -1,5 +1,6 @@
 //! Where the command line prints: data to stdout, talk to stderr. Works without colour.
 
+use crate::pages::{Listed, Page};
 use clap::ValueEnum;
 use prost::{Message, Name};
 use std::borrow::Cow;
@@ -49,8 +50,8 @@ impl Out {
     pub fn new(format: Format) -> Self {
         Self { format, page: false, unwritten: OnceLock::new() }
     }
-    /// Prints as asked for.
-    pub fn of(output: Output) -> Self {
+    /// Prints as the command line asks for it.
+    pub fn for_output(output: Output) -> Self {
         let format = match output {
             Output::Table | Output::Html => Format::Table,
             Output::Json => Format::Json,
@@ -75,14 +76,14 @@ impl Out {
     pub fn unwritten(&self) -> Option<ErrorKind> {
         self.unwritten.get().copied()
     }
-    /// A word to the person.
-    pub fn say(&self, text: &str) {
+    /// Prints a word to the person, which no program reads.
+    pub fn inform(&self, text: &str) {
         let _ = writeln!(std::io::stderr().lock(), "{}", lines(text));
     }
     /// What to do next, for a person only.
     pub fn next(&self, text: &str) {
         if self.format == Format::Table {
-            self.say(&format!("next: {text}"));
+            self.inform(&format!("next: {text}"));
         }
     }
     /// A message as JSON.
@@ -101,7 +102,7 @@ impl Out {
         let (text, left_out) = fitting(width, header, rows, spare);
         self.line(text.trim_end());
         if !left_out.is_empty() {
-            self.say(&format!("not shown, the terminal is narrow: {}", left_out.join(" ")));
+            self.inform(&format!("not shown, the terminal is narrow: {}", left_out.join(" ")));
         }
     }
     /// One object: a message, or its name, or lines for people.
@@ -117,6 +118,10 @@ impl Out {
             Format::Json | Format::Jsonl => self.json(message)?,
         }
         Ok(())
+    }
+    /// A list, in the columns of what is listed.
+    pub fn list<P: Page<Item: Listed>>(&self, whole: &P) -> anyhow::Result<()> {
+        self.many(whole, whole.items(), Listed::name, P::Item::HEADER, Listed::row)
     }
     /// Many objects: `whole` is the message that holds them.
     pub fn many<W: Message + Name, M: Message + Name>(
@@ -175,7 +180,8 @@ pub fn few(names: Vec<String>) -> Vec<String> {
     names.into_iter().take(NAMES_SHOWN).chain(more).collect()
 }
 
-/// Columns as wide as their widest cell.
+/// Columns as wide as their widest cell. Ours: a crate for tables brings two more with it, and leaves no columns out by
+/// how much they matter.
 pub fn columns(header: &[&str], rows: &[Vec<String>]) -> String {
     let rows: Vec<Vec<Cow<'_, str>>> = rows.iter().map(|row| row.iter().map(|cell| plain(cell)).collect()).collect();
     let mut widths: Vec<usize> = header.iter().map(|h| h.len()).collect();

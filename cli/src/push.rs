@@ -5,7 +5,7 @@
 
 use super::client::{Call, Exit, unary};
 use super::out::Out;
-use crate::way::Line;
+use crate::endpoint::Line;
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_bundle::folder::{Checked, Folder};
 use midshift_bundle::freshness::{newest_targets, stamp};
@@ -57,7 +57,7 @@ pub async fn run(path: &Path, call: &Call, out: &Out) -> Result<(), Exit> {
         format!("root {}, targets {}: {words}", told.root_version, told.targets_version)
     })?;
     if told.root_version < push.checked.root_version {
-        out.say("the newest root goes with the next targets document: sign one");
+        out.inform("the newest root goes with the next targets document: sign one");
     }
     out.next("midshift bundle ls");
     Ok(())

@@ -2,6 +2,7 @@
 
 use super::client::{Call, Change, DryRun, Exit, ended, unary};
 use super::out::Out;
+use super::pages::{self, Listed, PAGE_SIZE};
 use clap::Subcommand;
 use midshift_proto::convert::time_of;
 use midshift_proto::ota::v1;
@@ -32,18 +33,9 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
         Verb::Ls { call } => {
             let mut client = call.rollouts().await?;
-            let mut whole = v1::ListQuarantinesResponse::default();
-            loop {
-                let request = v1::ListQuarantinesRequest { page_size: 1_000, page_token: whole.next_page_token };
-                let page = client.list_quarantines(unary(request)).await?.into_inner();
-                whole.quarantines.extend(page.quarantines);
-                whole.next_page_token = page.next_page_token;
-                if whole.next_page_token.is_empty() {
-                    break;
-                }
-            }
-            let header = ["ROBOT", "BUNDLE", "WHY", "SINCE", "ROLLOUT"];
-            out.many(&whole, &whole.quarantines, |q| format!("{} {}", q.robot_id, q.bundle), &header, row)?;
+            let request = |page_token| unary(v1::ListQuarantinesRequest { page_size: PAGE_SIZE, page_token });
+            let whole = pages::all(async |page_token| client.list_quarantines(request(page_token)).await).await?;
+            out.list(&whole)?;
             if let Some(first) = whole.quarantines.first() {
                 out.next(&format!("midshift quarantine lift {} {}", first.robot_id, named(first)));
             }
@@ -86,14 +78,20 @@ fn named(quarantine: &v1::Quarantine) -> &str {
     if quarantine.bundle_label.is_empty() { &quarantine.bundle } else { &quarantine.bundle_label }
 }
 
-fn row(quarantine: &v1::Quarantine) -> Vec<String> {
-    vec![
-        quarantine.robot_id.clone(),
-        named(quarantine).to_owned(),
-        quarantine.reason.as_ref().map(|r| r.code.clone()).unwrap_or_default(),
-        quarantine.since.as_ref().map(|t| time_of(t).rfc3339()).unwrap_or_default(),
-        quarantine.rollout_id.clone(),
-    ]
+impl Listed for v1::Quarantine {
+    const HEADER: &'static [&'static str] = &["ROBOT", "BUNDLE", "WHY", "SINCE", "ROLLOUT"];
+    fn name(&self) -> String {
+        format!("{} {}", self.robot_id, self.bundle)
+    }
+    fn row(&self) -> Vec<String> {
+        vec![
+            self.robot_id.clone(),
+            named(self).to_owned(),
+            self.reason.as_ref().map(|r| r.code.clone()).unwrap_or_default(),
+            self.since.as_ref().map(|t| time_of(t).rfc3339()).unwrap_or_default(),
+            self.rollout_id.clone(),
+        ]
+    }
 }
 
 #[cfg(test)]
@@ -124,6 +122,6 @@ mod tests {
     fn a_bundle_that_no_release_lists_any_more_is_called_by_its_digest() {
         let listed = v1::Quarantine { bundle: "ab".into(), bundle_label: "walk-1.5.0".into(), ..Default::default() };
         let unlisted = v1::Quarantine { bundle: "ab".into(), ..Default::default() };
-        assert_eq!([&listed, &unlisted].map(|q| row(q)[1].clone()), ["walk-1.5.0", "ab"]);
+        assert_eq!([&listed, &unlisted].map(|q| q.row()[1].clone()), ["walk-1.5.0", "ab"]);
     }
 }

@@ -2,6 +2,7 @@
 
 use super::client::{Call, Change, Exit, WOULD, ended, unary};
 use super::out::{Format, Out};
+use super::pages::{self, PAGE_SIZE};
 use midshift_proto::ota::v1;
 use std::collections::BTreeMap;
 
@@ -30,16 +31,10 @@ pub fn runs(software: &[v1::RobotSoftware]) -> BTreeMap<&str, Runs> {
 /// Lists bundles.
 pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
     let mut client = call.bundles().await?;
-    let mut whole = v1::ListBundlesResponse::default();
-    loop {
-        let request = v1::ListBundlesRequest { page_size: 1_000, page_token: whole.next_page_token };
-        let page = client.list_bundles(unary(request)).await?.into_inner();
-        whole.bundles.extend(page.bundles);
-        (whole.next_page_token, whole.room) = (page.next_page_token, page.room);
-        if whole.next_page_token.is_empty() {
-            break;
-        }
-    }
+    let request = |page_token| unary(v1::ListBundlesRequest { page_size: PAGE_SIZE, page_token });
+    let mut whole = pages::all(async |page_token| client.list_bundles(request(page_token)).await).await?;
+    // Which keys the server lacks is the doctor's to tell.
+    whole.keyless = None;
     // Programs ask ListRobotSoftware themselves: the JSON is the answer about bundles and no more.
     let software = if out.format == Format::Table { software(call).await? } else { Vec::new() };
     let runs = runs(&software);
@@ -52,7 +47,7 @@ pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
     };
     out.many(&whole, &whole.bundles, |b| b.digest.clone(), &header, row)?;
     if out.format == Format::Table {
-        out.say(&room(&whole.room.unwrap_or_default()));
+        out.inform(&room(&whole.room.unwrap_or_default()));
     }
     Ok(())
 }
@@ -77,16 +72,11 @@ fn robots(runs: Runs) -> String {
 
 async fn software(call: &Call) -> Result<Vec<v1::RobotSoftware>, Exit> {
     let mut client = call.rollouts().await?;
-    let (mut all, mut page_token) = (Vec::new(), String::new());
-    loop {
-        let request = v1::ListRobotSoftwareRequest { robot_id: String::new(), page_size: 1_000, page_token };
-        let page = client.list_robot_software(unary(request)).await?.into_inner();
-        all.extend(page.software);
-        page_token = page.next_page_token;
-        if page_token.is_empty() {
-            return Ok(all);
-        }
-    }
+    let request = |page_token| {
+        let robot_id = String::new();
+        unary(v1::ListRobotSoftwareRequest { robot_id, page_size: PAGE_SIZE, page_token })
+    };
+    Ok(pages::all(async |page_token| client.list_robot_software(request(page_token)).await).await?.software)
 }
 
 /// Takes a bundle back.

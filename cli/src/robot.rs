@@ -1,20 +1,22 @@
 //! `midshift robot …`
 
 mod adopt;
+mod one;
 mod software;
 mod table;
 
+pub use one::{One, find};
 pub use table::controls;
 
-use super::client::{Call, Change, Exit, follow, unary};
+use super::client::{Call, Change, Exit, Guarded, follow, unary};
 use super::enrol::{self, Machine};
 use super::explain::verdict;
-use super::lookup::{self, Found, whole_id};
 use super::out::{Format, Out, few, plain};
 use super::rollout;
 use super::zone;
 use clap::Subcommand;
 use midshift_core::time::Utc;
+use midshift_proto::convert::duration;
 use midshift_proto::fleet::v1 as fleet;
 use midshift_proto::json;
 use midshift_proto::telemetry::v1;
@@ -45,110 +47,43 @@ pub enum Verb {
     /// Why a robot has no work.
     Explain(One),
     /// No new work; what it does now, it finishes.
-    Cordon {
-        #[command(flatten)]
-        one: One,
-        /// Why it gets no new work.
-        #[arg(long)]
-        reason: String,
-        /// Only if it is still as this etag says.
-        #[arg(long, default_value = "")]
-        if_match: String,
-        #[command(flatten)]
-        change: Change,
-    },
+    Cordon(Order),
     /// Back to work; also resets the breaker.
-    Uncordon {
-        #[command(flatten)]
-        one: One,
-        /// Only if it is still as this etag says.
-        #[arg(long, default_value = "")]
-        if_match: String,
-        #[command(flatten)]
-        change: Change,
-    },
+    Uncordon(Bare),
     /// Out of work for maintenance: its task ends or waits, it parks, and then nothing moves it.
     Drain {
         #[command(flatten)]
-        one: One,
-        /// What for.
-        #[arg(long)]
-        reason: String,
+        order: Order,
         /// Site time after which it is given up and the robot works on.
         #[arg(long, value_parser = super::duration, default_value = "30m")]
         within: Duration,
-        /// Only if it is still as this etag says.
-        #[arg(long, default_value = "")]
-        if_match: String,
-        #[command(flatten)]
-        change: Change,
     },
     /// Back to work after a drain.
-    Undrain {
-        #[command(flatten)]
-        one: One,
-        /// Only if it is still as this etag says.
-        #[arg(long, default_value = "")]
-        if_match: String,
-        #[command(flatten)]
-        change: Change,
-    },
+    Undrain(Bare),
     /// Out of the fleet for good: no work, and no roll-out or drain waits for it any more.
-    Retire {
-        #[command(flatten)]
-        one: One,
-        /// Why it leaves the fleet.
-        #[arg(long)]
-        reason: String,
-        /// Only if it is still as this etag says.
-        #[arg(long, default_value = "")]
-        if_match: String,
-        #[command(flatten)]
-        change: Change,
-    },
+    Retire(Order),
     /// Ignore an attempt that the robot lists and the server does not know. It must stand still; no place and no load is freed.
     Disown {
         #[command(flatten)]
-        one: One,
+        order: Order,
         /// The attempt as `robot explain` names it: task_id/epoch or errand:robot:number/epoch.
         attempt: String,
-        /// What you saw.
-        #[arg(long)]
-        reason: String,
-        /// Only if it is still as this etag says.
-        #[arg(long, default_value = "")]
-        if_match: String,
-        #[command(flatten)]
-        change: Change,
     },
     /// Settle by your word that it carries nothing. A robot that knows its load by memory alone forgets it; one that feels it is believed.
     Load {
         #[command(flatten)]
-        one: One,
+        order: Order,
         /// It carries nothing.
         #[arg(long, required = true)]
         none: bool,
-        /// What you saw.
-        #[arg(long)]
-        reason: String,
-        /// Only if it is still as this etag says.
-        #[arg(long, default_value = "")]
-        if_match: String,
-        #[command(flatten)]
-        change: Change,
     },
     /// Give it labels that go before what it says itself, or take such labels back.
     Label {
         #[command(flatten)]
-        one: One,
+        order: Bare,
         /// KEY=VALUE gives one, KEY- takes one back.
         #[arg(required = true)]
         labels: Vec<String>,
-        /// Only if it is still as this etag says.
-        #[arg(long, default_value = "")]
-        if_match: String,
-        #[command(flatten)]
-        change: Change,
     },
     /// Keep it at the software that it runs.
     Pin {
@@ -230,13 +165,25 @@ pub enum Verb {
     },
 }
 
-/// One robot.
+/// What fleet is told about one robot.
 #[derive(clap::Args)]
-pub struct One {
+pub struct Bare {
     #[command(flatten)]
-    call: Call,
-    /// Its id, or a prefix that only one robot has.
-    robot_id: String,
+    one: One,
+    #[command(flatten)]
+    guarded: Guarded,
+}
+
+/// What fleet is told about one robot, and why.
+#[derive(clap::Args)]
+pub struct Order {
+    #[command(flatten)]
+    one: One,
+    /// Why: what you saw, or what it is for.
+    #[arg(long)]
+    reason: String,
+    #[command(flatten)]
+    guarded: Guarded,
 }
 
 impl Verb {
@@ -244,10 +191,12 @@ impl Verb {
     fn one(&mut self) -> Option<&mut One> {
         match self {
             Self::Get(one) | Self::Explain(one) => Some(one),
-            Self::Cordon { one, .. } | Self::Uncordon { one, .. } | Self::Drain { one, .. } => Some(one),
-            Self::Undrain { one, .. } | Self::Retire { one, .. } | Self::Disown { one, .. } => Some(one),
+            Self::Cordon(Order { one, .. }) | Self::Retire(Order { one, .. }) => Some(one),
+            Self::Uncordon(Bare { one, .. }) | Self::Undrain(Bare { one, .. }) => Some(one),
+            Self::Drain { order: Order { one, .. }, .. } | Self::Disown { order: Order { one, .. }, .. } => Some(one),
+            Self::Load { order: Order { one, .. }, .. } | Self::Label { order: Bare { one, .. }, .. } => Some(one),
             Self::Pin { one, .. } | Self::Unpin { one, .. } | Self::Exclude { one, .. } => Some(one),
-            Self::Load { one, .. } | Self::Unstick { one, .. } | Self::Label { one, .. } => Some(one),
+            Self::Unstick { one, .. } => Some(one),
             // A robot that is enrolled needs not have been heard.
             Self::Revoke { .. } | Self::Enroll(_) | Self::Replace { .. } | Self::Adopt { .. } => None,
             Self::Ls { .. } | Self::Watch { .. } | Self::Identities { .. } => None,
@@ -255,17 +204,19 @@ impl Verb {
     }
 }
 
-/// The whole id of a robot that the server has heard of.
-pub async fn find(call: &Call, typed: &str) -> Result<String, Exit> {
-    let mut client = call.telemetry().await?;
-    let listed = async {
-        let filter = Some(v1::RobotFilter { robot_id_prefix: typed.to_owned(), ..v1::RobotFilter::default() });
-        let request = v1::ListRobotsRequest { filter, page_size: lookup::SHOWN, page_token: String::new() };
-        let page = client.list_robots(unary(request)).await?.into_inner();
-        let row = |robot: &v1::Robot| vec![table::presence(robot)];
-        Ok(Found::page(&page.robots, &page.next_page_token, |r| &r.robot_id, row))
-    };
-    whole_id("robot", typed, listed).await
+/// Sends fleet a command about one robot; what is decided about the robot after it.
+macro_rules! command {
+    ($one:ident, $guarded:ident, $call:ident, $request:ident { $($field:ident),* }) => {{
+        let request = fleet::$request {
+            robot_id: $one.robot_id.clone(),
+            request_id: $guarded.change.request_id.clone(),
+            etag: $guarded.if_match.clone(),
+            validate_only: $guarded.change.dry_run,
+            $($field),*
+        };
+        let answer = $one.call.fleet().await?.$call(unary(request)).await;
+        answer.map(|answer| answer.into_inner().control.unwrap_or_default())
+    }};
 }
 
 /// Runs one verb.
@@ -291,120 +242,53 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Adopt { call, robot_id, key, replace } => adopt::run(&call, &robot_id, key, replace, out).await,
         Verb::Revoke { one, reason } => enrol::revoke(&one.call, &one.robot_id, reason, out).await,
         Verb::Identities { call } => enrol::list(&call, out).await,
-        Verb::Cordon { one, reason, if_match, change } => {
-            let request = fleet::CordonRobotRequest {
-                robot_id: one.robot_id.clone(),
-                request_id: change.request_id,
-                etag: if_match,
-                reason,
-                validate_only: change.dry_run,
-            };
-            let answer = one.call.fleet().await?.cordon_robot(unary(request)).await?.into_inner();
-            control(&answer.control.unwrap_or_default(), out)?;
+        Verb::Cordon(Order { one, reason, guarded }) => {
+            show(&command!(one, guarded, cordon_robot, CordonRobotRequest { reason })?, out)?;
             out.next(&format!("midshift robot uncordon {}", one.robot_id));
             Ok(())
         }
-        Verb::Uncordon { one, if_match, change } => {
-            let request = fleet::UncordonRobotRequest {
-                robot_id: one.robot_id,
-                request_id: change.request_id,
-                etag: if_match,
-                validate_only: change.dry_run,
-            };
-            let answer = one.call.fleet().await?.uncordon_robot(unary(request)).await?.into_inner();
-            control(&answer.control.unwrap_or_default(), out)?;
-            Ok(())
+        Verb::Uncordon(Bare { one, guarded }) => {
+            Ok(show(&command!(one, guarded, uncordon_robot, UncordonRobotRequest {})?, out)?)
         }
-        Verb::Drain { one, reason, within, if_match, change } => {
-            let within_ms = u64::try_from(within.as_millis()).unwrap_or(u64::MAX);
-            let request = fleet::DrainRobotRequest {
-                robot_id: one.robot_id.clone(),
-                request_id: change.request_id,
-                etag: if_match,
-                reason,
-                within: Some(midshift_proto::convert::duration(within_ms)),
-                validate_only: change.dry_run,
-            };
-            let answer = one.call.fleet().await?.drain_robot(unary(request)).await?.into_inner();
-            control(&answer.control.unwrap_or_default(), out)?;
+        Verb::Drain { order: Order { one, reason, guarded }, within } => {
+            let within = Some(duration(u64::try_from(within.as_millis()).unwrap_or(u64::MAX)));
+            show(&command!(one, guarded, drain_robot, DrainRobotRequest { reason, within })?, out)?;
             out.next(&format!("midshift robot get {0}; midshift robot undrain {0}", one.robot_id));
             Ok(())
         }
-        Verb::Undrain { one, if_match, change } => {
-            let request = fleet::UndrainRobotRequest {
-                robot_id: one.robot_id,
-                request_id: change.request_id,
-                etag: if_match,
-                validate_only: change.dry_run,
-            };
-            let answer = one.call.fleet().await?.undrain_robot(unary(request)).await?.into_inner();
-            control(&answer.control.unwrap_or_default(), out)?;
-            Ok(())
+        Verb::Undrain(Bare { one, guarded }) => {
+            Ok(show(&command!(one, guarded, undrain_robot, UndrainRobotRequest {})?, out)?)
         }
-        Verb::Retire { one, reason, if_match, change } => {
-            let request = fleet::RetireRobotRequest {
-                robot_id: one.robot_id.clone(),
-                request_id: change.request_id,
-                etag: if_match,
-                reason,
-                validate_only: change.dry_run,
-            };
-            let answer = one.call.fleet().await?.retire_robot(unary(request)).await?.into_inner();
-            control(&answer.control.unwrap_or_default(), out)?;
+        Verb::Retire(Order { one, reason, guarded }) => {
+            show(&command!(one, guarded, retire_robot, RetireRobotRequest { reason })?, out)?;
             out.next(&format!("midshift robot uncordon {} brings it back", one.robot_id));
-            if !change.dry_run {
+            if !guarded.change.dry_run {
                 zone::tell_kept(&one.call, &one.robot_id, out).await;
             }
             Ok(())
         }
-        Verb::Disown { one, attempt, reason, if_match, change } => {
+        Verb::Disown { order: Order { one, reason, guarded }, attempt } => {
             let named = attempt.rsplit_once('/').and_then(|(subject, epoch)| Some((subject, epoch.parse().ok()?)));
-            let Some((subject, epoch)) = named else {
+            let Some((subject, epoch)) = named.map(|(subject, epoch)| (subject.to_owned(), epoch)) else {
                 return Err(Exit::usage(format!("{attempt} is no attempt: say SUBJECT/EPOCH, as robot explain does")));
             };
-            let request = fleet::DisownAttemptRequest {
-                robot_id: one.robot_id,
-                request_id: change.request_id,
-                etag: if_match,
-                reason,
-                validate_only: change.dry_run,
-                subject: subject.to_owned(),
-                epoch,
-            };
-            let answer = one.call.fleet().await?.disown_attempt(unary(request)).await?.into_inner();
-            control(&answer.control.unwrap_or_default(), out)?;
-            Ok(())
+            let request = command!(one, guarded, disown_attempt, DisownAttemptRequest { reason, subject, epoch });
+            Ok(show(&request?, out)?)
         }
-        Verb::Load { one, none: _, reason, if_match, change } => {
-            let request = fleet::SettleRobotLoadRequest {
-                robot_id: one.robot_id.clone(),
-                request_id: change.request_id,
-                etag: if_match,
-                reason,
-                validate_only: change.dry_run,
-            };
-            let answer = one.call.fleet().await?.settle_robot_load(unary(request)).await.map_err(Exit::with_facts)?;
-            let settled = answer.into_inner().control.unwrap_or_default();
-            control(&settled, out)?;
+        Verb::Load { order: Order { one, reason, guarded }, none: _ } => {
+            let settled = command!(one, guarded, settle_robot_load, SettleRobotLoadRequest { reason });
+            let settled = settled.map_err(Exit::with_facts)?;
+            show(&settled, out)?;
             if settled.load_settled.is_some_and(|word| word.is_told) {
                 // It says within a heartbeat or two that it has forgotten it.
                 out.next(&format!("midshift robot get {}", one.robot_id));
             }
             Ok(())
         }
-        Verb::Label { one, labels, if_match, change } => {
+        Verb::Label { order: Bare { one, guarded }, labels } => {
             let (labels, removed) = relabeling(&labels)?;
-            let request = fleet::LabelRobotRequest {
-                robot_id: one.robot_id,
-                request_id: change.request_id,
-                etag: if_match,
-                labels,
-                removed,
-                validate_only: change.dry_run,
-            };
-            let answer = one.call.fleet().await?.label_robot(unary(request)).await.map_err(Exit::with_facts)?;
-            control(&answer.into_inner().control.unwrap_or_default(), out)?;
-            Ok(())
+            let labelled = command!(one, guarded, label_robot, LabelRobotRequest { labels, removed });
+            Ok(show(&labelled.map_err(Exit::with_facts)?, out)?)
         }
         Verb::Pin { one, reason, change } => software::pin(&one, reason, change, out).await,
         Verb::Unpin { one, change } => software::unpin(&one, change, out).await,
@@ -433,7 +317,7 @@ fn relabeling(words: &[String]) -> Result<(BTreeMap<String, String>, Vec<String>
     Ok((labels, removed))
 }
 
-fn control(control: &fleet::RobotControl, out: &Out) -> anyhow::Result<()> {
+fn show(control: &fleet::RobotControl, out: &Out) -> anyhow::Result<()> {
     out.one(control, &control.robot_id, || control_line(control))
 }
 

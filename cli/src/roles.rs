@@ -69,7 +69,7 @@ impl Default for Roles {
 
 impl Roles {
     /// These; all if none is named.
-    pub fn of(named: &[Role]) -> Self {
+    pub fn from_names(named: &[Role]) -> Self {
         if named.is_empty() { Self::default() } else { Self(named.iter().copied().collect()) }
     }
     /// Whether this process has it.
@@ -103,6 +103,6 @@ mod tests {
         for role in Role::ALL {
             assert_eq!(role.to_possible_value().map(|value| value.get_name().to_owned()).as_deref(), Some(role.name()));
         }
-        assert!(Roles::of(&[Role::StopFollower]).are_split() && !Roles::default().are_split());
+        assert!(Roles::from_names(&[Role::StopFollower]).are_split() && !Roles::default().are_split());
     }
 }

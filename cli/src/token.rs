@@ -2,6 +2,7 @@
 
 use super::client::{Call, Exit, unary};
 use super::out::Out;
+use super::pages::{self, PAGE_SIZE};
 use crate::duration;
 use clap::Subcommand;
 use midshift_agent::clock;
@@ -131,16 +132,11 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         }
         Verb::Ls { call } => {
             let mut client = call.identity().await?;
-            let mut asked = v1::ListTokensRequest { page_size: 1_000, ..v1::ListTokensRequest::default() };
-            let mut all = v1::ListTokensResponse::default();
-            loop {
-                let page = client.list_tokens(unary(asked.clone())).await?.into_inner();
-                all.tokens.extend(page.tokens);
-                if page.next_page_token.is_empty() {
-                    break;
-                }
-                asked.page_token = page.next_page_token;
-            }
+            let read = async |page_token| {
+                let request = v1::ListTokensRequest { page_size: PAGE_SIZE, page_token };
+                client.list_tokens(unary(request)).await
+            };
+            let all = pages::all(read).await?;
             let now = clock::wall();
             let names = names(&all.tokens, now);
             let header = ["TOKEN", "NAME", "PERSON", "RIGHTS", "UNTIL", "STATE"];

@@ -2,6 +2,7 @@
 
 use super::client::{Call, Change, Exit, unary};
 use super::out::{Format, Out};
+use super::pages::{self, Listed, PAGE_SIZE};
 use clap::Subcommand;
 use midshift_proto::fleet::v1;
 
@@ -36,12 +37,7 @@ pub enum Verb {
 /// Runs one verb.
 pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
-        Verb::Ls { call, in_use } => {
-            let whole = list(&call, in_use).await?;
-            let header = ["PLACE", "KIND", "SEATS", "HELD BY", "WAITING", "QUARANTINE", "ETAG"];
-            out.many(&whole, &whole.places, |p| p.place_id.clone(), &header, row)?;
-            Ok(())
-        }
+        Verb::Ls { call, in_use } => Ok(out.list(&list(&call, in_use).await?)?),
         Verb::Clear { call, place_id, reason, if_match, change } => {
             let request = v1::ClearPlaceRequest {
                 place_id,
@@ -51,7 +47,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
                 validate_only: change.dry_run,
             };
             let place = call.fleet().await?.clear_place(unary(request)).await?.into_inner().place.unwrap_or_default();
-            out.one(&place, &place.place_id, || row(&place).join("  "))?;
+            out.one(&place, &place.place_id, || place.row().join("  "))?;
             Ok(())
         }
     }
@@ -59,16 +55,8 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
 
 async fn list(call: &Call, in_use: bool) -> Result<v1::ListPlacesResponse, Exit> {
     let mut client = call.fleet().await?;
-    let mut whole = v1::ListPlacesResponse::default();
-    loop {
-        let request = v1::ListPlacesRequest { in_use, page_size: 1_000, page_token: whole.next_page_token.clone() };
-        let page = client.list_places(unary(request)).await?.into_inner();
-        whole.places.extend(page.places);
-        whole.next_page_token = page.next_page_token;
-        if whole.next_page_token.is_empty() {
-            return Ok(whole);
-        }
-    }
+    let request = |page_token| unary(v1::ListPlacesRequest { in_use, page_size: PAGE_SIZE, page_token });
+    Ok(pages::all(async |page_token| client.list_places(request(page_token)).await).await?)
 }
 
 /// Says which places stay kept for a robot, and how a person opens them. What was asked is done: that this list cannot be had is no error.
@@ -90,21 +78,27 @@ fn kept(place: &v1::Place, robot_id: &str) -> String {
     )
 }
 
-fn row(place: &v1::Place) -> Vec<String> {
-    let holder = |h: &v1::PlaceHolder| {
-        let state = h.state().as_str_name().trim_start_matches("PLACE_HOLDER_STATE_").to_lowercase();
-        format!("{} {state}", h.robot_id)
-    };
-    let awaited = place.awaited_robot_ids.iter().map(|robot_id| format!("{robot_id} awaited"));
-    vec![
-        place.place_id.clone(),
-        place.kind().as_str_name().trim_start_matches("PLACE_KIND_").to_owned(),
-        place.capacity.to_string(),
-        place.holders.iter().map(holder).chain(awaited).collect::<Vec<_>>().join(", "),
-        place.waiting_robot_ids.join(", "),
-        place.quarantine.as_ref().map(|q| q.code.clone()).unwrap_or_default(),
-        place.etag.clone(),
-    ]
+impl Listed for v1::Place {
+    const HEADER: &'static [&'static str] = &["PLACE", "KIND", "SEATS", "HELD BY", "WAITING", "QUARANTINE", "ETAG"];
+    fn name(&self) -> String {
+        self.place_id.clone()
+    }
+    fn row(&self) -> Vec<String> {
+        let holder = |h: &v1::PlaceHolder| {
+            let state = h.state().as_str_name().trim_start_matches("PLACE_HOLDER_STATE_").to_lowercase();
+            format!("{} {state}", h.robot_id)
+        };
+        let awaited = self.awaited_robot_ids.iter().map(|robot_id| format!("{robot_id} awaited"));
+        vec![
+            self.place_id.clone(),
+            self.kind().as_str_name().trim_start_matches("PLACE_KIND_").to_owned(),
+            self.capacity.to_string(),
+            self.holders.iter().map(holder).chain(awaited).collect::<Vec<_>>().join(", "),
+            self.waiting_robot_ids.join(", "),
+            self.quarantine.as_ref().map(|q| q.code.clone()).unwrap_or_default(),
+            self.etag.clone(),
+        ]
+    }
 }
 
 #[cfg(test)]

@@ -37,11 +37,14 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/ota/src/rollouts/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/stop/src/line.rs", "one task a robot's line: it must outlive the handler that opened it"),
     ("services/stop/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
-    ("services/midshift/src/scenario.rs", "the binary makes releases for a story"),
-    ("services/midshift/src/scenario/watch.rs", "the binary looks at robots while a story is played"),
+    ("services/midshift/src/dev/scenario.rs", "the binary makes releases for a story"),
+    ("services/midshift/src/dev/scenario/watch.rs", "the binary looks at robots while a story is played"),
     ("services/midshift/src/backup/files.rs", "files are copied and read beside the runtime's threads"),
     ("services/midshift/src/stop_follower.rs", "files of the stop service are read beside the runtime's threads"),
-    ("services/midshift/src/machines.rs", "the binary enrols many machines side by side and renews what they got"),
+    (
+        "services/midshift/src/enrol_simulated.rs",
+        "the binary enrols many machines side by side and renews what they got",
+    ),
     ("services/midshift/src/stop/manager.rs", "a service manager that hangs must not hold up the stop service"),
     ("services/midshift/src/stop.rs", "who is known is followed as long as the port of the stop service is open"),
     ("services/midshift/src/robots.rs", "the binary lets a person walk beside its robot"),
@@ -49,8 +52,8 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/store/src/sqlite/frames.rs", "the one writer of a file and its checkpoints"),
     ("services/store/src/postgres/mod.rs", "the one writer of a process, and what hears of the others"),
     ("services/store/src/postgres/frames.rs", "the one writer of a process"),
-    ("services/midshift/src/dev.rs", "the binary wires the parts"),
-    ("services/midshift/src/commands/mod.rs", "the binary listens for Ctrl-C"),
+    ("services/midshift/src/dev/run.rs", "the binary wires the parts"),
+    ("services/midshift/src/commands/interrupts.rs", "the binary listens for Ctrl-C"),
 ];
 
 /// Files are made durable, and given their names, by the crate `durable`. Elsewhere only here, each for a reason.

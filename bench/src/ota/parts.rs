@@ -316,7 +316,7 @@ async fn pull(server: SocketAddr, mut asked: watch::Receiver<bool>) -> anyhow::R
 }
 
 async fn fetch(server: &str, sets: &Path, wanted: Wanted) -> anyhow::Result<()> {
-    let remote = GrpcRemote::new(Bulk::new(Arc::new(TcpDial::bulk(&midshift_cli::way::uri(server), None)?)));
+    let remote = GrpcRemote::new(Bulk::new(Arc::new(TcpDial::bulk(&midshift_cli::endpoint::uri(server), None)?)));
     let mut worker = UpdateWorker::new(Box::new(DiskSets::open(sets)?), Arc::new(remote));
     loop {
         let job = Job::Fetch { wanted, bases: Vec::new(), rate_bytes_s: 0 };

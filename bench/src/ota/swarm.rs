@@ -32,7 +32,7 @@ pub async fn run(args: SwarmArgs, stop: CancellationToken) -> anyhow::Result<()>
     let clock: Arc<dyn Clock> = midshift::clock::clock(1000);
     let config = FleetConfig { faults: FaultRates::none(), drains: false, ..FleetConfig::new(site, args.robots, SEED) };
     let hall = Arc::new(Fleet::open(&config, &clock.now())?);
-    let uri = midshift_cli::way::uri(&args.server);
+    let uri = midshift_cli::endpoint::uri(&args.server);
     let mut swarm = SwarmConfig::tcp(hall, clock, &uri, SEED);
     swarm.software = Some(Trust::read(&args.trust)?);
     Swarm::new(swarm).run(stop).await?;

@@ -42,7 +42,7 @@ pub async fn run(args: PullArgs, address: SocketAddr, stop: CancellationToken) -
     answer_questions(address, stop.clone(), move |_| counted.load(Relaxed))?;
     let mut all = JoinSet::new();
     for _ in 0..args.downloads {
-        let dial = TcpDial::bulk(&midshift_cli::way::uri(&args.server), None)?;
+        let dial = TcpDial::bulk(&midshift_cli::endpoint::uri(&args.server), None)?;
         let (remote, bytes) = (GrpcRemote::new(Bulk::new(Arc::new(dial))), bytes.clone());
         all.spawn(async move { again(&remote, &digest, args.length, &bytes).await });
     }

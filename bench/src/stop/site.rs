@@ -4,7 +4,7 @@
 
 use anyhow::Context;
 use midshift_agent::tls::{self, Tls};
-use midshift_cli::way::Way;
+use midshift_cli::endpoint::Endpoint;
 use midshift_core::ids::SiteId;
 use midshift_core::time::Clock;
 use midshift_identity::{Duty, IdentityService, Parts};
@@ -90,8 +90,8 @@ impl Site {
         Ok(std::fs::write(to, serde_json::to_vec(proofs)?)?)
     }
     /// The way of the person who stops.
-    pub fn way(&self, address: &str) -> anyhow::Result<Way> {
-        Way::secure(address, &self.principals.authority_pem, Some(&self.token))
+    pub fn way(&self, address: &str) -> anyhow::Result<Endpoint> {
+        Endpoint::secure(address, &self.principals.authority_pem, Some(&self.token))
     }
 }
 

@@ -83,7 +83,7 @@ impl Turns {
 /// Everybody who takes part.
 struct Stage {
     robots: usize,
-    client: StopServiceClient<midshift_cli::way::Line>,
+    client: StopServiceClient<midshift_cli::endpoint::Line>,
     /// Ended before those that they dial.
     simulators: Vec<(Child, PathBuf)>,
     fan: Child,

@@ -1,6 +1,6 @@
 //! `midshift bundle root …` and `bundle trust`: who signs from the next root on, and what robots are given of that. Nothing here needs a server.
 
-use super::{handed, public_key, read_keys, told};
+use super::files::{print_json, public_key, read_keys, read_signatures};
 use crate::client::Exit;
 use crate::out::{Format, Out, columns};
 use clap::{Subcommand, ValueEnum};
@@ -133,20 +133,20 @@ fn draft(repository: &Path, change: Option<&Change>, out: &Out) -> Result<(), Ex
     let folder = Folder::open(repository)?;
     let gone = folder.draft_root(change, clock::wall())?;
     if gone > 0 {
-        out.say(&format!("the draft had {gone} signatures: they went with this change, so each must sign again"));
+        out.inform(&format!("the draft had {gone} signatures: they went with this change, so each must sign again"));
     }
     tell_waiting(&folder, repository, out)
 }
 
 fn sign(repository: &Path, keys: &[PathBuf], signatures: &[PathBuf], out: &Out) -> Result<(), Exit> {
     let folder = Folder::open(repository)?;
-    let (keys, handed) = (read_keys(keys)?, handed(signatures)?);
+    let (keys, handed) = (read_keys(keys)?, read_signatures(signatures)?);
     let keys: Vec<&SecretKey> = keys.iter().collect();
     match folder.sign_root(&keys, &handed)? {
         Signed::Pending => tell_waiting(&folder, repository, out),
         Signed::Published(version) => {
-            told(&serde_json::json!({"rootVersion": version}), out);
-            out.say(&format!("signed by enough people: metadata/{version}.root.json is the newest root"));
+            print_json(&serde_json::json!({"rootVersion": version}), out);
+            out.inform(&format!("signed by enough people: metadata/{version}.root.json is the newest root"));
             let repository = repository.display();
             out.next(&format!("midshift bundle sign --renew --repository {repository} --key targets-1.pem"));
             Ok(())
@@ -157,10 +157,10 @@ fn sign(repository: &Path, keys: &[PathBuf], signatures: &[PathBuf], out: &Out) 
 fn tell_waiting(folder: &Folder, repository: &Path, out: &Out) -> Result<(), Exit> {
     let Some(waiting) = folder.waiting_root()? else { return Ok(()) };
     let before = RootDraft::of(&folder.root()?.1).map_err(Error::from)?;
-    told(&waiting_page(&waiting), out);
+    print_json(&waiting_page(&waiting), out);
     say_waiting(&before, &waiting, out);
     let repository = repository.display();
-    out.say(
+    out.inform(
         "hand over metadata/pending.root.json: it has no secrets, and each signer looks at it with bundle root show",
     );
     out.next(&format!("midshift bundle root sign --repository {repository} --key root-1.pem"));
@@ -169,14 +169,14 @@ fn tell_waiting(folder: &Folder, repository: &Path, out: &Out) -> Result<(), Exi
 
 fn say_waiting(before: &RootDraft, waiting: &WaitingRoot, out: &Out) {
     let version = waiting.draft.version;
-    out.say(&format!(
+    out.inform(&format!(
         "root {version} waits in metadata/pending.root.json; it is signed by {}",
         ids(&waiting.signed_by)
     ));
     for line in differences(before, &waiting.draft) {
-        out.say(&format!("  {line}"));
+        out.inform(&format!("  {line}"));
     }
-    out.say(&format!(
+    out.inform(&format!(
         "  lacks {} signatures of the keys of root {}, and {} of its own",
         waiting.lacks_of_before, before.version, waiting.lacks_of_own
     ));
@@ -250,7 +250,7 @@ fn show(repository: &Path, message_file: Option<&Path>, out: &Out) -> Result<(),
             };
             let rows: Vec<_> = Role::ALL.into_iter().map(row).collect();
             out.line(columns(&["ROLE", "MUST SIGN", "KEYS"], &rows).trim_end());
-            out.say(&format!("root {version}, valid until {}", newest.expires.rfc3339()));
+            out.inform(&format!("root {version}, valid until {}", newest.expires.rfc3339()));
             if let Some(waiting) = &waiting {
                 say_waiting(&newest, waiting, out);
             }
@@ -278,12 +278,12 @@ pub fn trust(repository: &Path, directive: &[PathBuf], site: &str, into: &Path, 
     let directive_keys = directive_keys.into_iter().map(|key| (key.id(), key)).collect();
     Trust { root, directive_keys, site }.write(into).map_err(|e| Exit::new(2, e.to_string()))?;
     let names: Vec<String> = ids.iter().map(ToString::to_string).collect();
-    told(&serde_json::json!({"file": into, "rootVersion": version, "directiveKeys": names}), out);
-    out.say(&format!(
+    print_json(&serde_json::json!({"file": into, "rootVersion": version, "directiveKeys": names}), out);
+    out.inform(&format!(
         "{}: root {version}, and orders signed by {}; it has no secrets",
         into.display(),
         self::ids(&ids)
     ));
-    out.say("robots get it before their first start, by hand or from a server that is started with --trust FILE");
+    out.inform("robots get it before their first start, by hand or from a server that is started with --trust FILE");
     Ok(())
 }

@@ -1,6 +1,6 @@
 //! What can be said of the machine that `doctor` runs on, and of a data folder on it.
 
-use super::Finding;
+use super::finding::Finding;
 use crate::stop_service;
 use midshift_core::{identity, limits};
 use std::collections::BTreeSet;
@@ -74,9 +74,10 @@ fn of_descriptors(whose: &str, limit: u64, robots: u64, each: u64) -> Finding {
     );
     match limit >= wanted {
         true => Finding::good("descriptors", text),
-        false => {
-            Finding::look("descriptors", format!("{text}: LimitNOFILE= in its unit, or ulimit -n before it is started"))
-        }
+        false => Finding::wants_look(
+            "descriptors",
+            format!("{text}: LimitNOFILE= in its unit, or ulimit -n before it is started"),
+        ),
     }
 }
 
@@ -91,7 +92,7 @@ pub fn data(folder: &Path) -> Vec<Finding> {
     let open: Vec<String> = private.iter().filter_map(|folder| is_open(folder)).collect();
     found.push(match open.is_empty() {
         true => Finding::good("exposure", format!("{} is for its owner alone", folder.display())),
-        false => Finding::look(
+        false => Finding::wants_look(
             "exposure",
             format!(
                 "{}: others on this machine can read what proves who is who; chmod 700, and ask who may have",
@@ -114,7 +115,7 @@ fn disk(folder: &Path) -> Finding {
             let [free, all] = [disk.f_bavail, disk.f_blocks].map(|blocks| blocks.saturating_mul(disk.f_frsize));
             of_disk(folder, free, all)
         }
-        Err(error) => Finding::look("disk", format!("{}: {error}", folder.display())),
+        Err(error) => Finding::wants_look("disk", format!("{}: {error}", folder.display())),
     }
 }
 
@@ -123,7 +124,7 @@ fn of_disk(folder: &Path, free: u64, all: u64) -> Finding {
     let text = format!("{} MiB ({percent} %) free for {}", free >> 20, folder.display());
     match percent >= FREE_PERCENT && free >= FREE_BYTES {
         true => Finding::good("disk", text),
-        false => Finding::look(
+        false => Finding::wants_look(
             "disk",
             format!(
                 "{text}: nothing is acknowledged any more when it is full; make room, or move the folder to a larger disk"

@@ -1,6 +1,6 @@
 //! What a server shows of itself before anybody asks it for anything: its certificates, and its clock.
 
-use super::{DAY_MS, Finding};
+use super::finding::{DAY_MS, Finding};
 use crate::client::{Exit, Resolved};
 use midshift_core::reason::Code;
 use midshift_core::time::Utc;
@@ -31,8 +31,8 @@ pub async fn certificates(resolved: &Resolved, now: Utc) -> Vec<Finding> {
             ];
             ends.into_iter().zip(what).map(|(end, (whose, days, then))| left(whose, end, now, days, then)).collect()
         }
-        Ok(_) => vec![Finding::look("certificates", "the server showed none that can be read")],
-        Err(error) => vec![Finding::look(
+        Ok(_) => vec![Finding::wants_look("certificates", "the server showed none that can be read")],
+        Err(error) => vec![Finding::wants_look(
             "certificates",
             format!("{error:#}; midshift login anew, if the site is another one now"),
         )],
@@ -45,7 +45,7 @@ pub async fn of_stop(resolved: &Resolved, address: &str, now: Utc) -> Option<Fin
         "it shows what was written down for it: look at the log of `midshift serve`, or of its role stop-follower";
     match ends(resolved, address).await {
         Ok(ends) => Some(left("the stop service's", *ends.first()?, now, SERVER_LEFT_DAYS, then)),
-        Err(error) => Some(Finding::look("certificates", format!("of the stop service: {error:#}"))),
+        Err(error) => Some(Finding::wants_look("certificates", format!("of the stop service: {error:#}"))),
     }
 }
 
@@ -54,17 +54,17 @@ pub fn left(whose: &str, end: Utc, now: Utc, least_days: u64, then: &str) -> Fin
     let days = end.ms_since(now) / DAY_MS;
     let at = end.rfc3339();
     if end <= now {
-        return Finding::look("certificates", format!("{whose} ENDED {at}; {then}"));
+        return Finding::wants_look("certificates", format!("{whose} ENDED {at}; {then}"));
     }
     let text = format!("{whose} ends {at}, in {days} days");
     if days < least_days {
-        return Finding::look("certificates", format!("{text}; {then}"));
+        return Finding::wants_look("certificates", format!("{text}; {then}"));
     }
     Finding::good("certificates", text)
 }
 
 async fn ends(resolved: &Resolved, address: &str) -> Result<Vec<Utc>, Exit> {
-    let wire = resolved.way(address)?.wire().await.map_err(anyhow::Error::from)?;
+    let wire = resolved.endpoint(address)?.wire().await.map_err(anyhow::Error::from)?;
     let Either::Right(stream) = wire else { return Ok(Vec::new()) };
     let shown = stream.get_ref().1.peer_certificates().unwrap_or_default();
     Ok(shown.iter().filter_map(|certificate| not_after(certificate)).collect())
@@ -127,7 +127,7 @@ pub fn clock(whose: &str, answer: &MetadataMap, now: Utc) -> Finding {
     }
     let (seconds, way) = if ahead > behind { (ahead / 1_000, "ahead of") } else { (behind / 1_000, "behind") };
     let then = "certificates and signatures are judged by it: set both from the network (NTP)";
-    Finding::look("clocks", format!("{whose} is {seconds} s {way} this machine; {then}"))
+    Finding::wants_look("clocks", format!("{whose} is {seconds} s {way} this machine; {then}"))
 }
 
 /// What its wall clock jumped while it ran: a person looks for a day, and sees it for as long as it runs.
@@ -139,7 +139,7 @@ pub fn jump(whose: &str, step_ms: i64, at: Utc, now: Utc) -> Finding {
     }
     let then =
         "tokens and times of tasks follow it; if it is wrong now, set it right (NTP): see docs/runbooks/clock.md";
-    Finding::look("clocks", format!("{text}; {then}"))
+    Finding::wants_look("clocks", format!("{text}; {then}"))
 }
 
 /// It signs nothing by its clock.
@@ -147,7 +147,7 @@ pub fn doubt(step_ms: i64, at: Utc) -> Finding {
     let way = if step_ms < 0 { "behind" } else { "ahead of" };
     let (off_s, at) = (step_ms.unsigned_abs() / 1_000, at.rfc3339());
     let then = Code::ClockDoubted.next_step();
-    Finding::look(
+    Finding::wants_look(
         "clocks",
         format!("the server signs nothing since {at}: its clock is {off_s} s {way} what it was; {then}"),
     )

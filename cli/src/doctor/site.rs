@@ -1,8 +1,9 @@
 //! Who may do what on a site, and from where it can be reached: certificates of robots, tokens, ports.
 
+use super::finding::{DAY_MS, Finding};
 use super::shown::left;
-use super::{DAY_MS, Finding};
 use crate::client::{Call, Exit, Resolved, unary};
+use crate::pages::{self, PAGE_SIZE};
 use midshift_core::limits;
 use midshift_core::time::Utc;
 use midshift_proto::convert::time_of;
@@ -26,31 +27,23 @@ pub async fn identities(call: &Call, resolved: &Resolved, now: Utc) -> Vec<Findi
         Err(exit) if exit.code() == 6 => {
             vec![Finding::good("tokens", "robots' certificates and tokens are shown to the role admin alone")]
         }
-        Err(exit) => vec![Finding::look("tokens", format!("robots' certificates and tokens cannot be read: {exit}"))],
+        Err(exit) => {
+            vec![Finding::wants_look("tokens", format!("robots' certificates and tokens cannot be read: {exit}"))]
+        }
     }
 }
 
 async fn listed(call: &Call) -> Result<(Vec<RobotIdentity>, Vec<Token>), Exit> {
-    let mut client = call.identity().await?;
-    let (mut robots, mut tokens) = (Vec::new(), Vec::new());
-    let mut next = ListRobotIdentitiesRequest { page_size: 1_000, ..Default::default() };
-    loop {
-        let page = client.list_robot_identities(unary(next.clone())).await?.into_inner();
-        robots.extend(page.robots);
-        if page.next_page_token.is_empty() {
-            break;
-        }
-        next.page_token = page.next_page_token;
-    }
-    let mut next = ListTokensRequest { page_size: 1_000, ..Default::default() };
-    loop {
-        let page = client.list_tokens(unary(next.clone())).await?.into_inner();
-        tokens.extend(page.tokens);
-        if page.next_page_token.is_empty() {
-            return Ok((robots, tokens));
-        }
-        next.page_token = page.next_page_token;
-    }
+    let client = call.identity().await?;
+    let robots = async |page_token| {
+        let request = ListRobotIdentitiesRequest { page_size: PAGE_SIZE, page_token, ..Default::default() };
+        client.clone().list_robot_identities(unary(request)).await
+    };
+    let tokens = async |page_token| {
+        let request = ListTokensRequest { page_size: PAGE_SIZE, page_token };
+        client.clone().list_tokens(unary(request)).await
+    };
+    Ok((pages::all(robots).await?.robots, pages::all(tokens).await?.tokens))
 }
 
 /// The soonest end of a robot's certificate, and who should have renewed it.
@@ -69,7 +62,7 @@ fn of_robots(robots: &[RobotIdentity], now: Utc) -> Finding {
         return told;
     }
     let then = "look whether they reach the server; one whose certificate has ended needs `midshift robot enroll`";
-    Finding::look("certificates", format!("{}; not renewed in time: {}; {then}", told.text, names(&late)))
+    Finding::wants_look("certificates", format!("{}; not renewed in time: {}; {then}", told.text, names(&late)))
 }
 
 /// Tokens that are good, those that end soon, and what they may do everywhere.
@@ -93,7 +86,11 @@ fn of_tokens(tokens: &[Token], now: Utc) -> Finding {
             "; more than one is good of the name: {twins}; revoke those that nobody uses: midshift token revoke TOKEN_ID"
         );
     }
-    if soon.is_empty() && twins.is_empty() { Finding::good("tokens", text) } else { Finding::look("tokens", text) }
+    if soon.is_empty() && twins.is_empty() {
+        Finding::good("tokens", text)
+    } else {
+        Finding::wants_look("tokens", text)
+    }
 }
 
 /// Names that more than one good token has: an older release made them.
@@ -121,7 +118,7 @@ pub fn exposure(resolved: &Resolved) -> Finding {
         (false, true) => {
             Finding::good("exposure", "plain text without login, on this machine alone: for trying things")
         }
-        (false, false) => Finding::look(
+        (false, false) => Finding::wants_look(
             "exposure",
             "plain text without login, and not on this machine alone: whoever reaches the port commands the fleet; leave --insecure away and sign in",
         ),

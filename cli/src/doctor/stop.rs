@@ -1,8 +1,8 @@
 //! The stop service of a site: whether it answers, keeps what it is told, knows who is known, and hears the robots that the server hears.
 
-use super::{Finding, shown};
-use crate::client::{Exit, Resolved, unary};
-use crate::stop::ANSWER_BYTES_MAX;
+use super::finding::Finding;
+use super::shown;
+use crate::client::{ANSWER_BYTES_MAX, Exit, Resolved, unary};
 use midshift_core::limits;
 use midshift_core::time::Utc;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
@@ -20,9 +20,9 @@ const PRINCIPALS_OLD_MS: u64 = limits::PRINCIPALS_TOLD_EVERY.as_ms() * 6;
 const NAMES_MAX: usize = 5;
 
 /// Everything about it. `online`: robots that the server hears.
-pub async fn look(resolved: &Resolved, address: &str, now: Utc, online: &[String]) -> Vec<Finding> {
+pub async fn check_stop_service(resolved: &Resolved, address: &str, now: Utc, online: &[String]) -> Vec<Finding> {
     if !serves(resolved, address).await.is_ok_and(|serves| serves) {
-        return vec![Finding::look(
+        return vec![Finding::wants_look(
             "stop",
             format!(
                 "no stop service of this site answers at {address}: `midshift stop` reaches nobody; `midshift stop serve`, or --stop-server if it is elsewhere"
@@ -37,20 +37,20 @@ pub async fn look(resolved: &Resolved, address: &str, now: Utc, online: &[String
             found.extend(of_status(&status, shown::said(&head).unwrap_or(now), online));
         }
         Err(exit) => {
-            found.push(Finding::look("stop", format!("what it keeps and whom it hears cannot be read: {exit}")))
+            found.push(Finding::wants_look("stop", format!("what it keeps and whom it hears cannot be read: {exit}")))
         }
     }
     found
 }
 
 async fn serves(resolved: &Resolved, address: &str) -> Result<bool, Exit> {
-    let line = resolved.way(address)?.connect().await.map_err(anyhow::Error::from)?;
+    let line = resolved.endpoint(address)?.connect().await.map_err(anyhow::Error::from)?;
     let request = tonic_health::pb::HealthCheckRequest { service: "midshift.stop.v1.StopService".to_owned() };
     Ok(HealthClient::new(line).check(unary(request)).await?.into_inner().status() == ServingStatus::Serving)
 }
 
 async fn status(resolved: &Resolved, address: &str) -> Result<(MetadataMap, Status), Exit> {
-    let line = resolved.way(address)?.connect().await.map_err(anyhow::Error::from)?;
+    let line = resolved.endpoint(address)?.connect().await.map_err(anyhow::Error::from)?;
     let mut client = StopServiceClient::new(line).max_decoding_message_size(ANSWER_BYTES_MAX);
     let (head, answer, _) = client.get_status(unary(GetStatusRequest {})).await?.into_parts();
     Ok((head, answer.status.unwrap_or_default()))
@@ -62,17 +62,17 @@ fn of_status(status: &Status, now: Utc, online: &[String]) -> Vec<Finding> {
     let disk = "make room on its disk, and look whether it can be written";
     if !status.durable {
         let text = "its disk refuses the latch: stops are obeyed, and forgotten if the stop service ends now";
-        found.push(Finding::look("stop", format!("{text}; {disk}")));
+        found.push(Finding::wants_look("stop", format!("{text}; {disk}")));
     }
     if status.audit_refused {
         let text = "its disk refuses the audit: who stopped and reset what waits in memory";
-        found.push(Finding::look("stop", format!("{text}; {disk}")));
+        found.push(Finding::wants_look("stop", format!("{text}; {disk}")));
     }
     let told = Utc(status.principals_told_unix_ms);
     if status.principals_told_unix_ms != 0 && now.ms_since(told) > PRINCIPALS_OLD_MS {
         let text = "it was last told who is known";
         let then = "somebody who was revoked since then is still let in there; start `midshift serve` or its role stop-follower on the same data folder";
-        found.push(Finding::look("stop", format!("{text} {}; {then}", told.rfc3339())));
+        found.push(Finding::wants_look("stop", format!("{text} {}; {then}", told.rfc3339())));
     }
     if status.clock_jump_ms != 0 {
         let at = Utc(status.clock_jumped_unix_ms);
@@ -91,7 +91,10 @@ fn of_status(status: &Status, now: Utc, online: &[String]) -> Vec<Finding> {
     let names = if more == 0 { named.join(", ") } else { format!("{} and {more} more", named.join(", ")) };
     let count = named.len() + more;
     let then = "no stop reaches them, and they slow down and stand by their own silence; look at --stop-server of their agents and at the way to that port";
-    found.push(Finding::look("stop", format!("{count} robots are online and have no line to it: {names}; {then}")));
+    found.push(Finding::wants_look(
+        "stop",
+        format!("{count} robots are online and have no line to it: {names}; {then}"),
+    ));
     found
 }
 

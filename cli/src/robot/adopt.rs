@@ -1,7 +1,8 @@
 //! `midshift robot adopt` and `robot replace --accept-key`: a person's word that a machine is the robot's.
 
-use super::super::client::{Call, Exit, unary};
-use super::super::out::Out;
+use crate::client::{Call, Exit, unary};
+use crate::out::Out;
+use crate::pages::{self, PAGE_SIZE};
 use anyhow::anyhow;
 use midshift_core::reason::Code;
 use midshift_proto::fleet::v1::ListIncidentsRequest;
@@ -9,9 +10,6 @@ use midshift_proto::identity::v1;
 use midshift_proto::ota::v1::AcceptDeviceKeyRequest;
 use midshift_proto::telemetry::v1::GetRobotRequest;
 use std::collections::BTreeSet;
-
-/// Incidents that are asked for at once.
-const PAGE: u32 = 1_000;
 
 /// Takes a machine in that is not enrolled.
 pub async fn run(call: &Call, robot_id: &str, key: Option<String>, replace: bool, out: &Out) -> Result<(), Exit> {
@@ -28,18 +26,15 @@ pub async fn run(call: &Call, robot_id: &str, key: Option<String>, replace: bool
 
 /// The key that the robot's open incidents name, if it is one.
 async fn shown(call: &Call, robot_id: &str) -> Result<String, Exit> {
-    let (mut client, mut keys) = (call.fleet().await?, BTreeSet::new());
-    let mut asked = ListIncidentsRequest { robot_id: robot_id.to_owned(), page_size: PAGE, ..Default::default() };
-    loop {
-        let page = client.list_incidents(unary(asked.clone())).await?.into_inner();
-        let reasons = page.incidents.into_iter().filter_map(|incident| incident.reason);
-        let named = reasons.filter(|reason| reason.code == Code::RobotNotEnrolled.as_str());
-        keys.extend(named.filter_map(|mut reason| reason.metadata.remove("key")));
-        if page.next_page_token.is_empty() {
-            break;
-        }
-        asked.page_token = page.next_page_token;
-    }
+    let mut client = call.fleet().await?;
+    let read = async |page_token| {
+        let robot_id = robot_id.to_owned();
+        let asked = ListIncidentsRequest { robot_id, page_size: PAGE_SIZE, page_token, ..Default::default() };
+        client.list_incidents(unary(asked)).await
+    };
+    let reasons = pages::all(read).await?.incidents.into_iter().filter_map(|incident| incident.reason);
+    let named = reasons.filter(|reason| reason.code == Code::RobotNotEnrolled.as_str());
+    let keys: BTreeSet<String> = named.filter_map(|mut reason| reason.metadata.remove("key")).collect();
     let mut all = keys.iter();
     match (all.next(), all.next()) {
         (Some(key), None) => Ok(key.clone()),

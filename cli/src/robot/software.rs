@@ -1,63 +1,44 @@
 //! `midshift robot pin|unpin|unstick`, and what is shown of a robot's software.
 
-use super::super::client::{Change, DryRun, Exit, ended, unary};
-use super::super::out::{Out, plain};
-use super::One;
+use super::one::One;
+use crate::client::{Change, Exit, ended, unary};
+use crate::out::{Out, plain};
 use midshift_proto::ota::v1;
 use midshift_proto::telemetry::v1::Robot;
 
+/// Sends a command about a robot's software, and prints what it runs after it and what comes `next`.
+macro_rules! command {
+    ($one:ident, $change:ident, $out:ident, $call:ident, $request:ident { $($reason:ident)? }, $next:expr) => {{
+        let only = $change.only();
+        let request = v1::$request {
+            robot_id: $one.robot_id.clone(),
+            request_id: $change.request_id,
+            validate_only: $change.dry_run,
+            $($reason)?
+        };
+        let answer = $one.call.rollouts().await?.$call(unary(request)).await.map_err(Exit::with_facts)?.into_inner();
+        let software = answer.software.unwrap_or_default();
+        $out.one(&software, &software.robot_id, || describe(&software))?;
+        ended(answer.done_before.as_ref(), only, $next, $out);
+        Ok(())
+    }};
+}
+
 /// Keeps a robot at the software that it runs.
 pub async fn pin(one: &One, reason: String, change: Change, out: &Out) -> Result<(), Exit> {
-    let only = change.only();
-    let request = v1::PinRobotRequest {
-        robot_id: one.robot_id.clone(),
-        reason,
-        request_id: change.request_id,
-        validate_only: change.dry_run,
-    };
-    let answer = one.call.rollouts().await?.pin_robot(unary(request)).await.map_err(Exit::with_facts)?.into_inner();
     let next = format!("midshift robot unpin {}", one.robot_id);
-    print_outcome(answer.software, answer.done_before, only, &next, out)
+    command!(one, change, out, pin_robot, PinRobotRequest { reason }, &next)
 }
 
 /// Lets a pinned robot take part in roll-outs again.
 pub async fn unpin(one: &One, change: Change, out: &Out) -> Result<(), Exit> {
-    let only = change.only();
-    let request = v1::UnpinRobotRequest {
-        robot_id: one.robot_id.clone(),
-        request_id: change.request_id,
-        validate_only: change.dry_run,
-    };
-    let answer = one.call.rollouts().await?.unpin_robot(unary(request)).await.map_err(Exit::with_facts)?.into_inner();
-    print_outcome(answer.software, answer.done_before, only, "", out)
+    command!(one, change, out, unpin_robot, UnpinRobotRequest {}, "")
 }
 
 /// Tells a robot that could not go back from a bundle to do so once more.
 pub async fn unstick(one: &One, reason: String, change: Change, out: &Out) -> Result<(), Exit> {
-    let only = change.only();
-    let request = v1::UnstickRobotRequest {
-        robot_id: one.robot_id.clone(),
-        reason,
-        request_id: change.request_id,
-        validate_only: change.dry_run,
-    };
-    let answer = one.call.rollouts().await?.unstick_robot(unary(request)).await.map_err(Exit::with_facts)?.into_inner();
     let next = format!("midshift robot get {}", one.robot_id);
-    print_outcome(answer.software, answer.done_before, only, &next, out)
-}
-
-/// Prints what a robot runs after a command about its software, and how the command ended.
-fn print_outcome(
-    software: Option<v1::RobotSoftware>,
-    done_before: Option<prost_types::Timestamp>,
-    only: DryRun,
-    next: &str,
-    out: &Out,
-) -> Result<(), Exit> {
-    let software = software.unwrap_or_default();
-    out.one(&software, &software.robot_id, || describe(&software))?;
-    ended(done_before.as_ref(), only, next, out);
-    Ok(())
+    command!(one, change, out, unstick_robot, UnstickRobotRequest { reason }, &next)
 }
 
 /// Says in words what a robot runs.

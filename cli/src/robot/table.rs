@@ -3,8 +3,9 @@
 //! Invariant: what is not known now is not shown as if it were: it stands in parentheses, with its age beside it.
 
 use crate::client::{Call, Exit, unary};
+use crate::endpoint::Line;
 use crate::out::{Format, Out, few};
-use crate::way::Line;
+use crate::pages::{self, PAGE_SIZE};
 use midshift_core::time::Utc;
 use midshift_proto::convert::{ms_of, time_of};
 use midshift_proto::fleet::v1 as fleet;
@@ -161,32 +162,18 @@ fn document(robot: &v1::Robot, control: Option<&fleet::RobotControl>) -> anyhow:
 
 async fn robots(call: &Call) -> Result<Vec<v1::Robot>, Exit> {
     let mut client = call.telemetry().await?;
-    let (mut robots, mut page_token) = (Vec::new(), String::new());
-    loop {
-        let request = v1::ListRobotsRequest { filter: None, page_size: 1_000, page_token };
-        let page = client.list_robots(unary(request)).await?.into_inner();
-        robots.extend(page.robots);
-        page_token = page.next_page_token;
-        if page_token.is_empty() {
-            return Ok(robots);
-        }
-    }
+    let request = |page_token| unary(v1::ListRobotsRequest { filter: None, page_size: PAGE_SIZE, page_token });
+    Ok(pages::all(async |page_token| client.list_robots(request(page_token)).await).await?.robots)
 }
 
 /// What was decided about robots, by robot, and the moment on the site clock at which that was looked at.
 pub async fn controls(
     client: &mut FleetServiceClient<Line>,
 ) -> Result<(BTreeMap<String, fleet::RobotControl>, Option<Utc>), Status> {
-    let (mut controls, mut page_token) = (BTreeMap::new(), String::new());
-    loop {
-        let request = fleet::ListRobotControlsRequest { page_size: 1_000, page_token };
-        let page = client.list_robot_controls(unary(request)).await?.into_inner();
-        controls.extend(page.controls.into_iter().map(|control| (control.robot_id.clone(), control)));
-        page_token = page.next_page_token;
-        if page_token.is_empty() {
-            return Ok((controls, page.list_time.as_ref().map(time_of)));
-        }
-    }
+    let request = |page_token| unary(fleet::ListRobotControlsRequest { page_size: PAGE_SIZE, page_token });
+    let whole = pages::all(async |page_token| client.list_robot_controls(request(page_token)).await).await?;
+    let controls = whole.controls.into_iter().map(|control| (control.robot_id.clone(), control)).collect();
+    Ok((controls, whole.list_time.as_ref().map(time_of)))
 }
 
 #[cfg(test)]

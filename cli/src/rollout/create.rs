@@ -1,7 +1,8 @@
 //! `midshift rollout create`: what a roll-out is asked to be, in flags.
 
+use super::commands::{begin, show};
 use super::parse::{pair, rate, wave};
-use super::{begin, show, text};
+use super::text;
 use crate::client::{Call, Exit, unary};
 use crate::out::{Out, columns};
 use clap::ValueEnum;
@@ -209,7 +210,7 @@ pub async fn run(args: Create, out: &Out) -> Result<(), Exit> {
         let request = v1::PlanRolloutRequest { rollout_id, spec };
         let plan = client.plan_rollout(unary(request)).await.map_err(|s| args.refused(s))?.into_inner();
         out.one(&plan, &args.rollout_id, || told(&args.rollout_id, &args.spec().waves, &plan))?;
-        out.say("a dry run: nothing was written");
+        out.inform("a dry run: nothing was written");
         out.next("the same without --dry-run writes it down, with --start it begins");
         return Ok(());
     }

@@ -2,9 +2,11 @@
 //!
 //! Invariant: nothing is asked again and again; the server sends each change.
 
-use super::{One, Until, text};
+use super::one::One;
+use super::text;
 use crate::client::{Exit, follow};
 use crate::out::{Format, Out};
+use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use midshift_proto::ota::v1::{self, RolloutEnding, RolloutPhase};
 use prost_types::Timestamp;
@@ -13,6 +15,15 @@ use std::io::IsTerminal;
 use std::ops::ControlFlow;
 use std::time::Duration;
 use tonic::Streaming;
+
+/// What to wait for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Until {
+    /// All robots are decided. Ends at once when that cannot be any more, or when a person must judge.
+    Completed,
+    /// Whatever end: also through a review and all the way back.
+    Ended,
+}
 
 /// Exit code: a person must judge.
 const REVIEW: u8 = 11;
@@ -37,8 +48,8 @@ pub struct Picture {
 }
 
 impl Picture {
-    /// Takes a message; what is new in it, a line each, with its time.
-    pub fn take(&mut self, message: v1::WatchRolloutResponse) -> Vec<String> {
+    /// Notes what a message says; what is new in it, a line each, with its time.
+    pub fn note_changes(&mut self, message: v1::WatchRolloutResponse) -> Vec<String> {
         let after = message.rollout.unwrap_or_default();
         let before = std::mem::replace(&mut self.rollout, after);
         let rollout = &self.rollout;
@@ -143,10 +154,10 @@ pub async fn watch(one: &One, out: &Out) -> Result<(), Exit> {
             };
             if matches!(out.format, Format::Json | Format::Jsonl) {
                 out.json(&message)?;
-                picture.take(message);
+                picture.note_changes(message);
                 return Ok(ControlFlow::Continue(()));
             }
-            let news = picture.take(message);
+            let news = picture.note_changes(message);
             if is_live {
                 bar.set_message(picture.lines().join("\n"));
             } else {

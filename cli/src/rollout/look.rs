@@ -1,8 +1,11 @@
 //! Reading roll-outs: lists, one of them, its robots, what one robot waits for, what happened.
 
-use super::{Client, One, text};
+use super::commands::Client;
+use super::one::One;
+use super::text;
 use crate::client::{Call, Exit, unary};
 use crate::out::{Format, Out, columns, plain};
+use crate::pages::{self, Listed, PAGE_SIZE};
 use midshift_proto::convert::time_of;
 use midshift_proto::json::to_json;
 use midshift_proto::ota::v1;
@@ -14,36 +17,33 @@ const NOT_FOUND: u8 = 4;
 /// Lists all.
 pub async fn list(call: &Call, out: &Out) -> Result<(), Exit> {
     let mut client = call.rollouts().await?;
-    let mut whole = v1::ListRolloutsResponse::default();
-    loop {
-        let (page_size, page_token) = (1_000, whole.next_page_token);
-        let request = v1::ListRolloutsRequest { page_size, page_token, ..v1::ListRolloutsRequest::default() };
-        let page = client.list_rollouts(unary(request)).await?.into_inner();
-        whole.rollouts.extend(page.rollouts);
-        whole.next_page_token = page.next_page_token;
-        if whole.next_page_token.is_empty() {
-            break;
-        }
-    }
-    let header = ["ROLLOUT", "BUNDLE", "PHASE", "WAVE", "DECIDED", "FAILED", "SINCE"];
-    Ok(out.many(&whole, &whole.rollouts, |r| r.rollout_id.clone(), &header, row)?)
+    let request = |page_token| {
+        let rollout_id_prefix = String::new();
+        unary(v1::ListRolloutsRequest { page_size: PAGE_SIZE, page_token, rollout_id_prefix })
+    };
+    Ok(out.list(&pages::all(async |page_token| client.list_rollouts(request(page_token)).await).await?)?)
 }
 
-/// One roll-out in columns.
-pub fn row(rollout: &v1::Rollout) -> Vec<String> {
-    let counts = rollout.counts.unwrap_or_default();
-    let waves = text::waves_of(rollout);
-    let wave = text::wave(rollout.wave, waves);
-    let begun = rollout.start_time.is_some();
-    vec![
-        rollout.rollout_id.clone(),
-        text::bundle(&rollout.bundle_label, rollout.spec.as_ref().map_or("", |s| &s.bundle)),
-        text::state(rollout),
-        if begun { wave.trim_start_matches("wave ").to_owned() } else { "-".to_owned() },
-        if begun { format!("{}/{}", text::decided(&counts), text::total(&counts)) } else { "-".to_owned() },
-        counts.failed.to_string(),
-        text::time(rollout.since.as_ref()),
-    ]
+impl Listed for v1::Rollout {
+    const HEADER: &'static [&'static str] = &["ROLLOUT", "BUNDLE", "PHASE", "WAVE", "DECIDED", "FAILED", "SINCE"];
+    fn name(&self) -> String {
+        self.rollout_id.clone()
+    }
+    fn row(&self) -> Vec<String> {
+        let counts = self.counts.unwrap_or_default();
+        let waves = text::waves_of(self);
+        let wave = text::wave(self.wave, waves);
+        let begun = self.start_time.is_some();
+        vec![
+            self.rollout_id.clone(),
+            text::bundle(&self.bundle_label, self.spec.as_ref().map_or("", |s| &s.bundle)),
+            text::state(self),
+            if begun { wave.trim_start_matches("wave ").to_owned() } else { "-".to_owned() },
+            if begun { format!("{}/{}", text::decided(&counts), text::total(&counts)) } else { "-".to_owned() },
+            counts.failed.to_string(),
+            text::time(self.since.as_ref()),
+        ]
+    }
 }
 
 /// All robots of one, or only one of them.
@@ -52,45 +52,44 @@ pub async fn members(
     rollout_id: &str,
     robot_id: &str,
 ) -> Result<v1::ListRolloutRobotsResponse, Exit> {
-    let mut whole = v1::ListRolloutRobotsResponse::default();
-    loop {
-        let request = v1::ListRolloutRobotsRequest {
-            rollout_id: rollout_id.to_owned(),
-            robot_id: robot_id.to_owned(),
-            page_size: 1_000,
-            page_token: whole.next_page_token,
-        };
-        let page = client.list_rollout_robots(unary(request)).await.map_err(Exit::with_facts)?.into_inner();
-        whole.robots.extend(page.robots);
-        whole.next_page_token = page.next_page_token;
-        if whole.next_page_token.is_empty() {
-            return Ok(whole);
-        }
-    }
+    let request = v1::ListRolloutRobotsRequest {
+        rollout_id: rollout_id.to_owned(),
+        robot_id: robot_id.to_owned(),
+        page_size: PAGE_SIZE,
+        page_token: String::new(),
+    };
+    let read = async |page_token| {
+        client.list_rollout_robots(unary(v1::ListRolloutRobotsRequest { page_token, ..request.clone() })).await
+    };
+    pages::all(read).await.map_err(Exit::with_facts)
 }
 
-/// Columns of a robot in a roll-out.
-const HEADER: [&str; 8] = ["ROBOT", "WAVE", "STEP", "SINCE", "FROM", "WAITS FOR", "WAITS SINCE", "UNTIL"];
-
-fn member(robot: &v1::RolloutRobot) -> Vec<String> {
-    let why = robot.failure.as_ref().or(robot.why.as_ref()).filter(|_| robot.blocked_by.is_none());
-    let waits = robot.blocked_by.as_ref().or(why).map(|r| r.code.clone()).unwrap_or_default();
-    vec![
-        robot.robot_id.clone(),
-        (robot.wave + 1).to_string(),
-        text::step(robot.step()).to_owned(),
-        text::time(robot.since.as_ref()),
-        robot.from_version.clone(),
-        waits,
-        text::time(robot.blocked_since.as_ref()),
-        text::time(robot.deadline.as_ref()),
-    ]
+impl Listed for v1::RolloutRobot {
+    const HEADER: &'static [&'static str] =
+        &["ROBOT", "WAVE", "STEP", "SINCE", "FROM", "WAITS FOR", "WAITS SINCE", "UNTIL"];
+    fn name(&self) -> String {
+        self.robot_id.clone()
+    }
+    fn row(&self) -> Vec<String> {
+        let why = self.failure.as_ref().or(self.why.as_ref()).filter(|_| self.blocked_by.is_none());
+        let waits = self.blocked_by.as_ref().or(why).map(|r| r.code.clone()).unwrap_or_default();
+        vec![
+            self.robot_id.clone(),
+            (self.wave + 1).to_string(),
+            text::step(self.step()).to_owned(),
+            text::time(self.since.as_ref()),
+            self.from_version.clone(),
+            waits,
+            text::time(self.blocked_since.as_ref()),
+            text::time(self.deadline.as_ref()),
+        ]
+    }
 }
 
 /// Lists robots of one.
 pub async fn robots(one: &One, out: &Out) -> Result<(), Exit> {
     let whole = members(&mut one.call.rollouts().await?, &one.rollout_id, "").await?;
-    out.many(&whole, &whole.robots, |r| r.robot_id.clone(), &HEADER, member)?;
+    out.list(&whole)?;
     out.next(&format!("midshift rollout explain {} ROBOT", one.rollout_id));
     Ok(())
 }
@@ -132,8 +131,8 @@ pub fn whole_text(rollout: &v1::Rollout, members: &[v1::RolloutRobot], robots: b
         lines.push(format!("began {}", text::time(rollout.start_time.as_ref())));
     }
     if robots {
-        let rows: Vec<Vec<String>> = members.iter().map(member).collect();
-        lines.push(columns(&HEADER, &rows));
+        let rows: Vec<Vec<String>> = members.iter().map(Listed::row).collect();
+        lines.push(columns(v1::RolloutRobot::HEADER, &rows));
     }
     lines.join("\n")
 }
@@ -167,7 +166,7 @@ pub async fn explain_all(one: &One, out: &Out) -> Result<(), Exit> {
             text::header(&rollout).iter().for_each(|line| out.line(line));
             whole.robots.iter().for_each(|robot| out.line(&explanation(&rollout, robot)));
         }
-        _ => out.many(&whole, &whole.robots, |r| r.robot_id.clone(), &HEADER, member)?,
+        _ => out.list(&whole)?,
     }
     out.next(&text::next(&rollout));
     Ok(())
@@ -260,7 +259,7 @@ pub async fn history(one: &One, out: &Out) -> Result<(), Exit> {
             }
         }
     }
-    out.say(
+    out.inform(
         "read from what the roll-out and its robots are now: of each robot its last step, of pauses none that ended",
     );
     Ok(())

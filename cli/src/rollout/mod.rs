@@ -3,23 +3,27 @@
 //! Exit codes of `watch` and `wait` beside the usual ones: 11 held for review, 12 aborted, rolled back or superseded,
 //! 14 ended, and too few robots have it.
 
+mod commands;
 mod create;
 mod follow;
 mod look;
+mod one;
 mod parse;
 mod report;
 #[cfg(test)]
 mod tests;
 mod text;
 
-use super::client::{Call, Change, Exit, ended, unary};
-use super::lookup::{self, Found, whole_id};
+pub use commands::exclude;
+pub use one::{One, find};
+
+use super::client::{Call, Change, Exit, unary};
 use super::out::Out;
-use super::robot;
-use crate::way::Line;
-use clap::{Subcommand, ValueEnum};
+use super::robot::find as find_robot;
+use clap::Subcommand;
+use commands::{Ask, ask, begin, show};
+use follow::Until;
 use midshift_proto::ota::v1;
-use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
 use std::time::Duration;
 
 /// Verbs of roll-outs.
@@ -131,24 +135,6 @@ pub enum Verb {
     },
 }
 
-/// What to wait for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum Until {
-    /// All robots are decided. Ends at once when that cannot be any more, or when a person must judge.
-    Completed,
-    /// Whatever end: also through a review and all the way back.
-    Ended,
-}
-
-/// One roll-out.
-#[derive(clap::Args)]
-pub struct One {
-    #[command(flatten)]
-    call: Call,
-    /// Its id, or a prefix that only one roll-out has.
-    rollout_id: String,
-}
-
 impl Verb {
     /// The one roll-out that it is about, and the one robot in it.
     fn named(&mut self) -> (Option<&mut One>, Option<&mut String>) {
@@ -167,18 +153,6 @@ impl Verb {
     pub fn makes_page(&self) -> bool {
         matches!(self, Self::Report(_))
     }
-}
-
-/// The whole id of a roll-out.
-pub async fn find(call: &Call, typed: &str) -> Result<String, Exit> {
-    let mut client = call.rollouts().await?;
-    let listed = async {
-        let (page_size, rollout_id_prefix) = (lookup::SHOWN, typed.to_owned());
-        let request = v1::ListRolloutsRequest { page_size, rollout_id_prefix, page_token: String::new() };
-        let page = client.list_rollouts(unary(request)).await?.into_inner();
-        Ok(Found::page(&page.rollouts, &page.next_page_token, |r| &r.rollout_id, look::row))
-    };
-    whole_id("rollout", typed, listed).await
 }
 
 /// One roll-out and why.
@@ -201,60 +175,12 @@ pub struct Seen {
     if_match: String,
 }
 
-/// The service.
-type Client = RolloutServiceClient<Line>;
-
-/// A request about one roll-out.
-#[derive(Clone, Copy, Debug)]
-enum Ask {
-    Submit,
-    Approve,
-    Start { supersede: bool },
-    Pause,
-    Resume,
-    Promote,
-    Abort,
-    Retry,
-}
-
-/// Sends one request; the roll-out after it.
-async fn ask(client: &mut Client, ask: Ask, rollout_id: &str, etag: &str, reason: &str) -> Result<v1::Rollout, Exit> {
-    let (rollout_id, etag, reason) = (rollout_id.to_owned(), etag.to_owned(), reason.to_owned());
-    macro_rules! send {
-        ($call:ident, $request:ident $(, $field:ident)?) => {
-            client
-                .$call(unary(v1::$request { rollout_id, etag, reason $(, $field)? }))
-                .await
-                .map(|answer| answer.into_inner().rollout)
-        };
-    }
-    let answer = match ask {
-        Ask::Submit => send!(submit_rollout, SubmitRolloutRequest),
-        Ask::Approve => send!(approve_rollout, ApproveRolloutRequest),
-        Ask::Start { supersede } => send!(start_rollout, StartRolloutRequest, supersede),
-        Ask::Pause => send!(pause_rollout, PauseRolloutRequest),
-        Ask::Resume => send!(resume_rollout, ResumeRolloutRequest),
-        Ask::Promote => send!(promote_rollout, PromoteRolloutRequest),
-        Ask::Abort => send!(abort_rollout, AbortRolloutRequest),
-        Ask::Retry => send!(retry_rollout, RetryRolloutRequest),
-    };
-    Ok(answer.map_err(Exit::with_facts)?.unwrap_or_default())
-}
-
-impl One {
-    async fn read(&self) -> Result<v1::Rollout, Exit> {
-        let request = v1::GetRolloutRequest { rollout_id: self.rollout_id.clone() };
-        let answer = self.call.rollouts().await?.get_rollout(unary(request)).await.map_err(Exit::with_facts)?;
-        Ok(answer.into_inner().rollout.unwrap_or_default())
-    }
-}
-
 /// Runs one verb.
 pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
     if let (Some(one), robot_id) = verb.named() {
         one.rollout_id = find(&one.call, &one.rollout_id).await?;
         if let Some(robot_id) = robot_id {
-            *robot_id = robot::find(&one.call, robot_id).await?;
+            *robot_id = find_robot(&one.call, robot_id).await?;
         }
     }
     match verb {
@@ -271,7 +197,7 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Exclude { one, robot_id, reason, change } => {
             exclude(&one.call, one.rollout_id, robot_id, reason, change, out).await
         }
-        Verb::Lost { one, robot_id, reason, change } => write_off(one, robot_id, reason, change, out).await,
+        Verb::Lost { one, robot_id, reason, change } => commands::write_off(one, robot_id, reason, change, out).await,
         Verb::Ls { call } => look::list(&call, out).await,
         Verb::Get { one, robots } => look::get(&one, robots, out).await,
         Verb::Robots(one) => look::robots(&one, out).await,
@@ -306,79 +232,4 @@ async fn roll_back(one: &One, new_rollout_id: String, start: bool, out: &Out) ->
         rollout = begin(&mut client, &rollout.rollout_id, false, out).await?;
     }
     show(&rollout, out)
-}
-
-/// Leaves a robot out.
-pub async fn exclude(
-    call: &Call,
-    rollout_id: String,
-    robot_id: String,
-    reason: String,
-    change: Change,
-    out: &Out,
-) -> Result<(), Exit> {
-    let only = change.only();
-    let request = v1::ExcludeRobotRequest {
-        rollout_id,
-        etag: String::new(),
-        reason,
-        robot_id,
-        request_id: change.request_id,
-        validate_only: change.dry_run,
-    };
-    let answer = call.rollouts().await?.exclude_robot(unary(request)).await.map_err(Exit::with_facts)?;
-    let answer = answer.into_inner();
-    show(&answer.rollout.unwrap_or_default(), out)?;
-    ended(answer.done_before.as_ref(), only, "", out);
-    Ok(())
-}
-
-/// Counts a lost robot in no budget.
-async fn write_off(one: One, robot_id: String, reason: String, change: Change, out: &Out) -> Result<(), Exit> {
-    let only = change.only();
-    let request = v1::WriteOffRobotRequest {
-        rollout_id: one.rollout_id,
-        etag: String::new(),
-        reason,
-        robot_id,
-        request_id: change.request_id,
-        validate_only: change.dry_run,
-    };
-    let answer = one.call.rollouts().await?.write_off_robot(unary(request)).await.map_err(Exit::with_facts)?;
-    let answer = answer.into_inner();
-    show(&answer.rollout.unwrap_or_default(), out)?;
-    ended(answer.done_before.as_ref(), only, "", out);
-    Ok(())
-}
-
-/// Submits, approves and starts one that is written down, and says each.
-async fn begin(client: &mut Client, rollout_id: &str, supersede: bool, out: &Out) -> Result<v1::Rollout, Exit> {
-    ask(client, Ask::Submit, rollout_id, "", "").await?;
-    out.say("checked against the fleet");
-    let by_another =
-        format!("midshift rollout approve {rollout_id} by somebody else, then midshift rollout start {rollout_id}");
-    let approved = ask(client, Ask::Approve, rollout_id, "", "").await.map_err(|exit| match exit.code() {
-        6 => exit.or_try(&by_another),
-        _ => exit,
-    })?;
-    out.say(approval(&approved));
-    let started = ask(client, Ask::Start { supersede }, rollout_id, "", "").await?;
-    out.say("started");
-    Ok(started)
-}
-
-/// Who stands for it.
-fn approval(rollout: &v1::Rollout) -> &'static str {
-    let by = |act: &Option<v1::RolloutAct>| act.as_ref().map(|a| a.actor.clone());
-    if by(&rollout.created) == by(&rollout.approved) {
-        "approved by its author: there is no login yet, so nobody else can be asked"
-    } else {
-        "approved"
-    }
-}
-
-fn show(rollout: &v1::Rollout, out: &Out) -> Result<(), Exit> {
-    out.one(rollout, &rollout.rollout_id, || text::header(rollout).join("\n"))?;
-    out.next(&text::next(rollout));
-    Ok(())
 }

@@ -5,7 +5,8 @@
 //! text in it.
 
 use super::look::{events, members, whole_text};
-use super::{One, text};
+use super::one::One;
+use super::text;
 use crate::client::Exit;
 use crate::out::{Format, Out};
 use midshift_proto::json::to_json;

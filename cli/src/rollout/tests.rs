@@ -1,7 +1,8 @@
 //! Words about fixed messages, and what a wait comes to.
 
-use super::follow::{Picture, end};
-use super::{Until, create, look, parse, report, text};
+use super::follow::{Picture, Until, end};
+use super::{create, look, parse, report, text};
+use crate::pages::Listed;
 use clap::Parser;
 use midshift_core::reason::{Code, Reason};
 use midshift_proto::convert::{duration, shown};
@@ -187,7 +188,7 @@ fn before_it_begins_the_tree_says_what_was_asked_for() {
     let lines = text::tree(&draft, [].iter());
     assert_eq!(lines, ["├─ wave 1/3: 1", "├─ wave 2/3: 25%", "└─ wave 3/3: rest"]);
     assert_eq!(text::next(&draft), "midshift rollout submit walk-1.5.0");
-    assert_eq!(&look::row(&draft)[2..6], ["DRAFT", "-", "-", "0"]);
+    assert_eq!(&draft.row()[2..6], ["DRAFT", "-", "-", "0"]);
 }
 
 #[test]
@@ -279,7 +280,7 @@ fn a_watch_tells_each_change_once() {
     let mut picture = Picture::default();
     let message = |rollout, robots| v1::WatchRolloutResponse { rollout: Some(rollout), robots };
     let before = v1::Rollout { verdicts: Vec::new(), phase: RolloutPhase::Applying as i32, wave: 0, ..rollout() };
-    let first = picture.take(message(before.clone(), vec![draining()]));
+    let first = picture.note_changes(message(before.clone(), vec![draining()]));
     assert_eq!(first.len(), 2, "{first:?}");
     assert_eq!(first[0], "1970-01-01T00:01:20.000Z  rbt-04  DRAINING  waits: WAITING_FOR_DRAIN");
     assert!(
@@ -289,20 +290,23 @@ fn a_watch_tells_each_change_once() {
     );
     // The same again, and a countdown: nothing to tell.
     let counted = v1::Rollout { soak_left: Some(duration(1)), ..before };
-    assert_eq!(picture.take(message(counted.clone(), vec![draining()])), Vec::<String>::new());
+    assert_eq!(picture.note_changes(message(counted.clone(), vec![draining()])), Vec::<String>::new());
     // A task that ends on trial is told, once.
     let works = |succeeded| {
         let trial = Some(v1::TaskTally { succeeded, failed: 0 });
         v1::RolloutRobot { trial, ..robot("rbt-07", 1, RolloutStep::Trial) }
     };
-    assert_eq!(picture.take(message(counted.clone(), vec![works(0)])).len(), 1);
-    assert_eq!(picture.take(message(counted.clone(), vec![works(1)])), ["rbt-07  TRIAL, 1 tasks done, 0 failed"]);
-    assert_eq!(picture.take(message(counted, vec![works(1)])), Vec::<String>::new());
-    let news = picture.take(message(rollout(), vec![robot("rbt-04", 1, RolloutStep::Activating)]));
+    assert_eq!(picture.note_changes(message(counted.clone(), vec![works(0)])).len(), 1);
+    assert_eq!(
+        picture.note_changes(message(counted.clone(), vec![works(1)])),
+        ["rbt-07  TRIAL, 1 tasks done, 0 failed"]
+    );
+    assert_eq!(picture.note_changes(message(counted, vec![works(1)])), Vec::<String>::new());
+    let news = picture.note_changes(message(rollout(), vec![robot("rbt-04", 1, RolloutStep::Activating)]));
     assert_eq!(news.len(), 3, "{news:?}");
     assert!(news[1].contains("PROMOTED_UNPROVEN") && news[1].contains("fewer than 95.0 % fail"), "{}", news[1]);
     let paused = v1::Rollout { pauses: vec![RolloutPause::Operator as i32], ..rollout() };
-    let news = picture.take(message(paused.clone(), Vec::new()));
+    let news = picture.note_changes(message(paused.clone(), Vec::new()));
     assert!(news[0].contains("SOAKING, paused (OPERATOR)"), "{news:?}");
     assert_eq!(text::next(&paused), "midshift rollout resume walk-1.5.0");
     let held = v1::Rollout { pauses: vec![RolloutPause::Content as i32], ..rollout() };
@@ -336,7 +340,8 @@ fn who_watches_a_bad_release_hears_which_robot_is_behind_its_end() {
     let behind = "aborted: FAILURE_AMONG_FEW: A robot failed while fewer than ten were attempted., behind it rbt-07, 1 robot had permission by then";
     assert_eq!(text::abort(&abort), behind);
     let rollout = v1::Rollout { rollout_id, abort: Some(abort), ..aborted };
-    let news = Picture::default().take(v1::WatchRolloutResponse { rollout: Some(rollout.clone()), robots: Vec::new() });
+    let news = Picture::default()
+        .note_changes(v1::WatchRolloutResponse { rollout: Some(rollout.clone()), robots: Vec::new() });
     let moved = "walk-1.6.0-bad-at-start  ABORTED  wave 2/3";
     assert!(news.iter().any(|line| line.contains(moved)), "{news:?}");
     let told = end(&rollout, Until::Ended).and_then(Result::err).unwrap().to_string();

@@ -3,13 +3,12 @@
 //! Invariant: what is known without asking is used without asking: a named address or a context costs no time. A guessed address is used only where a person types, who
 //! is shown the site first. The stop service itself refuses whoever means another site.
 
-use super::super::client::{Exit, Login, Resolved, unary};
-use super::super::door::Found;
-use super::super::out::Out;
-use super::ANSWER_BYTES_MAX;
+use crate::client::{ANSWER_BYTES_MAX, Exit, Login, Resolved, unary};
+use crate::door::Found;
+use crate::endpoint::Line;
+use crate::out::Out;
 use crate::site_answer::SiteAnswer;
 use crate::stop_service;
-use crate::way::Line;
 use clap::Args;
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
@@ -114,7 +113,7 @@ impl StopCall {
         if target.site_id.is_empty() && giver == Giver::Person {
             target.site_id = timeout(SAID_WITHIN, self.named(&target)).await.ok().flatten().unwrap_or_default();
             let site = if target.site_id.is_empty() { "a site that it does not name" } else { &target.site_id };
-            out.say(&format!("the stop service at {} is that of {site}", target.address));
+            out.inform(&format!("the stop service at {} is that of {site}", target.address));
         }
         Ok(target)
     }
@@ -130,13 +129,13 @@ impl StopCall {
         answer.status.map(|status| status.site_id)
     }
 
-    /// A way to it that stands.
+    /// A connection to it that stands.
     pub async fn client(&self, target: &Target) -> Result<StopServiceClient<Line>, Exit> {
         let address = &target.address;
-        let (way, mut tries) = (self.resolved()?.way(address)?, DIALS);
+        let (endpoint, mut tries) = (self.resolved()?.endpoint(address)?, DIALS);
         let line = loop {
             tries -= 1;
-            match way.connect().await {
+            match endpoint.connect().await {
                 Ok(line) => break line,
                 Err(error) if tries == 0 => return Err(nobody(address, &*error.0)),
                 Err(error) if Found::by(&*error.0) == Found::Silence => return Err(nobody(address, &*error.0)),

@@ -1,30 +1,28 @@
 //! `midshift task cancel|resolve --all`: pages of requests until nobody is meant any more.
 
-use super::Which;
+use super::one::Which;
 use crate::client::{Change, Exit, unary};
 use crate::out::Out;
 use midshift_proto::task::v1;
 use std::collections::BTreeMap;
+use tonic::Status;
 
 /// Ends every task that is meant.
 pub async fn cancel(which: &Which, reason: &str, force: bool, change: &Change, out: &Out) -> Result<(), Exit> {
-    let filter = which.meant.filter()?;
     let mut client = which.call.task().await?;
-    let mut sum = Sum::default();
-    loop {
-        let request = v1::CancelTasksRequest {
-            filter: Some(filter.clone()),
-            request_id: change.request_id.clone(),
-            reason: reason.to_owned(),
-            force,
-            validate_only: change.dry_run,
-            page_token: sum.outcome.next_page_token.clone(),
-        };
-        let outcome = client.cancel_tasks(unary(request)).await?.into_inner().outcome.unwrap_or_default();
-        if sum.add(outcome) {
-            return sum.tell("cancel", change, out);
-        }
-    }
+    let request = v1::CancelTasksRequest {
+        filter: Some(which.meant.filter()?),
+        request_id: change.request_id.clone(),
+        reason: reason.to_owned(),
+        force,
+        validate_only: change.dry_run,
+        page_token: String::new(),
+    };
+    let ask = async |page_token| {
+        let request = v1::CancelTasksRequest { page_token, ..request.clone() };
+        Ok(client.cancel_tasks(unary(request)).await?.into_inner().outcome)
+    };
+    Sum::of_pages(ask).await?.print("cancel", change, out)
 }
 
 /// Answers every task that is meant.
@@ -35,44 +33,46 @@ pub async fn resolve(
     change: &Change,
     out: &Out,
 ) -> Result<(), Exit> {
-    let filter = which.meant.filter()?;
     let mut client = which.call.task().await?;
-    let mut sum = Sum::default();
-    loop {
-        let request = v1::ResolveTasksRequest {
-            filter: Some(filter.clone()),
-            request_id: change.request_id.clone(),
-            resolution: resolution as i32,
-            reason: reason.to_owned(),
-            validate_only: change.dry_run,
-            page_token: sum.outcome.next_page_token.clone(),
-        };
-        let outcome = client.resolve_tasks(unary(request)).await?.into_inner().outcome.unwrap_or_default();
-        if sum.add(outcome) {
-            return sum.tell("resolve", change, out);
-        }
-    }
+    let request = v1::ResolveTasksRequest {
+        filter: Some(which.meant.filter()?),
+        request_id: change.request_id.clone(),
+        resolution: resolution as i32,
+        reason: reason.to_owned(),
+        validate_only: change.dry_run,
+        page_token: String::new(),
+    };
+    let ask = async |page_token| {
+        let request = v1::ResolveTasksRequest { page_token, ..request.clone() };
+        Ok(client.resolve_tasks(unary(request)).await?.into_inner().outcome)
+    };
+    Sum::of_pages(ask).await?.print("resolve", change, out)
 }
 
 /// Outcomes of all pages together.
-#[derive(Default)]
 struct Sum {
     outcome: v1::BulkOutcome,
 }
 
 impl Sum {
-    /// Adds a page; true: it was the last.
-    fn add(&mut self, page: v1::BulkOutcome) -> bool {
-        self.outcome.matched += page.matched;
-        self.outcome.asked += page.asked;
-        self.outcome.pending = page.pending;
-        self.outcome.next_page_token = page.next_page_token;
-        for (code, tasks) in page.refused {
-            *self.outcome.refused.entry(code).or_default() += tasks;
+    /// Asks for page after page until nobody is meant any more.
+    async fn of_pages(
+        mut ask: impl AsyncFnMut(String) -> Result<Option<v1::BulkOutcome>, Status>,
+    ) -> Result<Self, Status> {
+        let mut sum = v1::BulkOutcome::default();
+        loop {
+            let page = ask(std::mem::take(&mut sum.next_page_token)).await?.unwrap_or_default();
+            (sum.matched, sum.asked) = (sum.matched + page.matched, sum.asked + page.asked);
+            (sum.pending, sum.next_page_token) = (page.pending, page.next_page_token);
+            for (code, tasks) in page.refused {
+                *sum.refused.entry(code).or_default() += tasks;
+            }
+            if sum.next_page_token.is_empty() {
+                return Ok(Self { outcome: sum });
+            }
         }
-        self.outcome.next_page_token.is_empty()
     }
-    fn tell(self, verb: &str, change: &Change, out: &Out) -> Result<(), Exit> {
+    fn print(self, verb: &str, change: &Change, out: &Out) -> Result<(), Exit> {
         let Self { outcome } = self;
         let refused: BTreeMap<&String, &u32> = outcome.refused.iter().collect();
         let why = refused.iter().map(|(code, tasks)| format!(", {tasks} refused with {code}")).collect::<String>();

@@ -2,7 +2,7 @@
 //!
 //! Invariant: a name of a stop is looked up among those that hold robots. None of these names begins another one, so what one alone begins with is that one.
 
-use super::One;
+use super::one::One;
 use crate::client::{Call, Change, Exit, unary};
 use crate::lookup::{self, Found, whole_id};
 use crate::out::Out;
@@ -88,11 +88,9 @@ fn holding<'a>(controls: impl IntoIterator<Item = &'a RobotControl>, typed: &str
             stops.entry(stop_id).or_default()[usize::from(hold == Hold::Stop)] += 1;
         }
     }
-    let stops: Vec<(StopId, [usize; 2])> = stops.into_iter().collect();
-    let (shown, more) = stops.split_at(stops.len().min(lookup::SHOWN as usize));
-    let next = more.first().map_or("", |(stop_id, _)| stop_id.as_str());
-    let words = |[waiting, stopped]: [usize; 2]| format!("robots that wait: {waiting}, stopped: {stopped}");
-    Found::page(shown, next, |(stop_id, _)| stop_id.as_str(), |(_, robots)| vec![words(*robots)])
+    let (shown, is_all) = (lookup::SHOWN as usize, stops.len() <= lookup::SHOWN as usize);
+    let words = |[waiting, stopped]: [usize; 2]| vec![format!("robots that wait: {waiting}, stopped: {stopped}")];
+    Found::new(stops.into_iter().take(shown).map(|(id, robots)| (id.to_string(), words(robots))), is_all)
 }
 
 fn resumed(answer: &v1::ResumeHeldResponse) -> String {

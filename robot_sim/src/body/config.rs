@@ -11,6 +11,8 @@ use serde::{Deserialize, Serialize};
 pub const MODEL: &str = "midshift-sim";
 /// The fastest a simulated body goes, millimetres per second.
 pub const SPEED_MAX_MM_S: u32 = 1_500;
+/// Key and value of the label by which a simulated robot says what it is.
+pub const BODY_LABEL: (&str, &str) = ("body", "simulated");
 /// The slowest it is asked to go, millimetres per second; also its speed at the stop level SLOW.
 pub const SPEED_FLOOR_MM_S: u32 = 300;
 

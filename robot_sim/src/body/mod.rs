@@ -18,7 +18,7 @@ use crate::journal::{Effect, Work};
 use crate::motion::Leg;
 use crate::world::{SharedWorld, lock};
 use act::Act;
-pub use config::{BodyConfig, Counts, MODEL, SPEED_FLOOR_MM_S, SPEED_MAX_MM_S};
+pub use config::{BODY_LABEL, BodyConfig, Counts, MODEL, SPEED_FLOOR_MM_S, SPEED_MAX_MM_S};
 use files::Keeper;
 pub use files::{Error, JOURNAL_FILE};
 use midshift_agent::body::{BodyNews, PathPoint};

@@ -1,6 +1,6 @@
 //! `trait Body` for the simulated body.
 
-use super::{MODEL, Order, Phase, SPEED_FLOOR_MM_S, SPEED_MAX_MM_S, SimBody};
+use super::{BODY_LABEL, MODEL, Order, Phase, SPEED_FLOOR_MM_S, SPEED_MAX_MM_S, SimBody};
 use crate::faults;
 use crate::journal::{Effect, Work};
 use crate::world::lock;
@@ -20,7 +20,7 @@ impl Body for SimBody {
     fn capabilities(&self) -> Inventory {
         Inventory {
             capabilities: ["inspect", "pick", "place"].map(str::to_owned).to_vec(),
-            labels: BTreeMap::from([("body".to_owned(), "simulated".to_owned())]),
+            labels: BTreeMap::from([(BODY_LABEL.0.to_owned(), BODY_LABEL.1.to_owned())]),
             payload_g: 15_000,
             software: self.config.software.clone(),
             agent_version: String::new(),

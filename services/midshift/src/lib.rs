@@ -3,35 +3,28 @@
 //! Called by `main.rs`, by the tests and by the benchmarks. Of a server's
 //! configuration, environment and clock nothing is read elsewhere.
 
-pub mod background;
 pub mod backup;
 mod changed_map;
 pub mod clock;
 pub mod clock_doubt;
 mod clock_jump;
 pub mod commands;
+mod components;
 mod denials;
 pub mod dev;
 pub mod door;
+pub mod enrol_simulated;
+mod housekeeping;
 pub mod logs;
-pub mod machines;
-mod parts;
 pub mod planning;
 pub mod recorder;
-pub mod report;
-mod resuming;
 pub mod robots;
-pub mod scenario;
 pub mod serve;
 pub mod server;
 mod software;
 pub mod stop;
 pub mod stop_follower;
 pub mod storage;
-pub mod tally;
-pub mod throwaway;
-pub mod under_way;
-mod upkeep;
 
 #[cfg(test)]
 #[path = "../../../tests/src/postgres.rs"]

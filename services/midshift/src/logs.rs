@@ -46,7 +46,7 @@ pub async fn count_floods() {
     let mut tick = tokio::time::interval(Duration::from_millis(limits::FLOOD_COUNTED_EVERY.as_ms()) / 4);
     loop {
         tick.tick().await;
-        counted().counts().iter().for_each(say);
+        counted().counts().iter().for_each(log_count);
     }
 }
 
@@ -83,7 +83,7 @@ impl Counted {
     }
 }
 
-fn say(count: &Count<Line>) {
+fn log_count(count: &Count<Line>) {
     let Count { line: (level, line), peer, times } = count;
     let (again, of) = ("more of these in the last minute", peer.as_deref().unwrap_or("many"));
     match *level {
@@ -119,7 +119,7 @@ struct Said {
 }
 
 impl Said {
-    fn take(&mut self, field: &Field, value: fmt::Arguments<'_>) {
+    fn add_field(&mut self, field: &Field, value: fmt::Arguments<'_>) {
         match field.name() {
             "message" => self.message = value.to_string(),
             "peer" => self.peer = Some(value.to_string()),
@@ -131,10 +131,10 @@ impl Said {
 
 impl Visit for Said {
     fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
-        self.take(field, format_args!("{value:?}"));
+        self.add_field(field, format_args!("{value:?}"));
     }
     fn record_str(&mut self, field: &Field, value: &str) {
-        self.take(field, format_args!("{value}"));
+        self.add_field(field, format_args!("{value}"));
     }
 }
 

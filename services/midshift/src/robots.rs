@@ -2,15 +2,15 @@
 
 use crate::clock;
 use crate::door;
-use crate::machines::Machines;
+use crate::enrol_simulated::{Machines, Replace, Replaced};
 use crate::software::{self, Behaving};
 use anyhow::{Context, bail};
 use midshift_agent::core::ExitReason;
 use midshift_agent::program::{Machine, Ways};
+use midshift_cli::endpoint::{Endpoint, with_scheme};
 use midshift_cli::site_file;
-use midshift_cli::way::{Way, with_scheme};
 use midshift_core::Boxed;
-use midshift_core::ids::WaypointId;
+use midshift_core::ids::{RobotId, WaypointId};
 use midshift_core::time::Clock;
 use midshift_sim::body::{BodyConfig, SimBody};
 use midshift_sim::faults::FaultRates;
@@ -94,6 +94,9 @@ pub struct SimRun {
     /// Whose software they take: the trust file of a robot of the site. Without it they keep what they came with.
     #[arg(long)]
     pub trust: Option<PathBuf>,
+    /// Also in place of robots that never said they are simulated: their machines lose their certificates.
+    #[arg(long)]
+    pub replace: bool,
     /// Also answer `sim.v1` (faults) here.
     #[arg(long)]
     pub listen: Option<SocketAddr>,
@@ -183,12 +186,15 @@ async fn visit(robot: SimHandle, seed: u64, clock: Arc<dyn Clock>) {
     }
 }
 
+/// The ways of whoever is signed in: to where machines are enrolled, and to the server that robots dial.
+pub type SignedIn = [Endpoint; 2];
+
 /// Runs a swarm until `stop`; enrolled by whoever is signed in, or in plain text.
-pub fn swarm(args: SimRun, signed_in: Option<Way>, stop: CancellationToken) -> Boxed<'static, anyhow::Result<()>> {
+pub fn swarm(args: SimRun, signed_in: Option<SignedIn>, stop: CancellationToken) -> Boxed<'static, anyhow::Result<()>> {
     Box::pin(swarming(args, signed_in, stop))
 }
 
-async fn swarming(args: SimRun, signed_in: Option<Way>, stop: CancellationToken) -> anyhow::Result<()> {
+async fn swarming(args: SimRun, signed_in: Option<SignedIn>, stop: CancellationToken) -> anyhow::Result<()> {
     let site = site_file::load(args.site.as_deref(), None, None)?.site;
     let clock: Arc<dyn Clock> = clock::clock(1000);
     let mut config = FleetConfig::new(site, args.robots, args.seed);
@@ -205,10 +211,12 @@ async fn swarming(args: SimRun, signed_in: Option<Way>, stop: CancellationToken)
     let hall = Arc::new(Fleet::open(&config, &clock.now())?);
     let (machines, scheme) = match &signed_in {
         None => (None, "http"),
-        Some(way) => {
-            let ids = hall.robots().iter().map(|robot| robot.robot_id().clone()).collect();
-            let address = args.identity.address(&args.server);
-            (Some(Machines::enrol(way, address, ids, args.data.as_deref()).await?), "https")
+        Some([identities, robots]) => {
+            let ids: Vec<RobotId> = hall.robots().iter().map(|robot| robot.robot_id().clone()).collect();
+            let (address, data) = (args.identity.address(&args.server), args.data.as_deref());
+            let replace = if args.replace { Replace::Any } else { Replace::Simulated };
+            let replaced = Replaced::find((identities, robots), &ids, data, replace).await?;
+            (Some(Machines::enrol(identities, address, ids, data, &replaced).await?), "https")
         }
     };
     let tls = machines.as_ref().map(Machines::tls).unwrap_or_default();
@@ -217,7 +225,9 @@ async fn swarming(args: SimRun, signed_in: Option<Way>, stop: CancellationToken)
     if let Some(address) = args.stop.address(&args.server, machines.is_some()) {
         swarm = swarm.with_stop(&with_scheme(scheme, &address));
     }
-    let _renewing = machines.map(|machines| machines.keep(args.identity.address(&args.server), &clock)).transpose()?;
+    let _renewing = machines
+        .map(|machines| machines.renew_certificates(args.identity.address(&args.server), &clock))
+        .transpose()?;
     swarm.software = trust;
     swarm.persistence = config.persistence.clone();
     let swarm = Swarm::new(swarm);

@@ -3,7 +3,7 @@
 
 use crate::door::{self, Share};
 use crate::planning::Planning;
-use crate::server::{Naive, Parts, Server};
+use crate::server::{Components, Naive, Server};
 use crate::storage::{Database, Storage};
 use crate::{backup, changed_map};
 use crate::{clock, clock_doubt, clock_jump, logs, stop, stop_follower};
@@ -176,7 +176,7 @@ pub fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> Boxed<'_, 
 }
 
 async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow::Result<()> {
-    let roles = Roles::of(&args.roles);
+    let roles = Roles::from_names(&args.roles);
     check_arguments(&args, &roles)?;
     // Before anything is opened: whoever finds the port taken leaves no trace.
     let listener = listen(args.listen).await?;
@@ -199,13 +199,13 @@ async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow
     let identity = open_identity(&args, &roles, &storage, &clock, &shutdown).await?;
     let (ota, reader) = open_software(&args, &roles, &storage, &clock, &shutdown).await?;
     let beacons = match args.beacon_listen {
-        Some(address) => Some(hear(address).await?),
+        Some(address) => Some(listen_for_beacons(address).await?),
         None => None,
     };
     let beside = start_stop(&args, &roles, &*storage.store(), identity.as_ref()).await?;
     tracing::info!(address = %listener.local_addr()?, site_id = %loaded.site.site_id(), data = %args.data.display(), store = storage.engine(), %roles, "midshift serves");
     let planning = Planning::start()?;
-    let parts = Parts {
+    let parts = Components {
         roles: roles.clone(),
         drain: args.drain(&roles),
         store: storage.store(),
@@ -466,6 +466,6 @@ async fn reader(folder: &Path, storage: &Storage, shutdown: &CancellationToken) 
 }
 
 /// The socket that beacons come to.
-pub async fn hear(address: SocketAddr) -> anyhow::Result<UdpSocket> {
+pub async fn listen_for_beacons(address: SocketAddr) -> anyhow::Result<UdpSocket> {
     UdpSocket::bind(address).await.with_context(|| format!("listening for beacons on {address}"))
 }

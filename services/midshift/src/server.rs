@@ -5,10 +5,10 @@
 //! whole server with it: none is served without the others. A gateway among several first says that it is not ready and lets its robots
 //! move over.
 
+pub use crate::components::{Components, Naive};
 use crate::door::{self, Login};
-pub use crate::parts::{Naive, Parts};
+use crate::housekeeping;
 use crate::stop_follower::StopFollower;
-use crate::upkeep;
 use crate::{denials, recorder};
 use anyhow::{Context, bail};
 use axum::routing::get;
@@ -39,7 +39,7 @@ use tonic_health::server::HealthReporter;
 
 /// The services of one process, ready to be served.
 pub struct Server {
-    parts: Parts,
+    parts: Components,
     task: Option<TaskService>,
     fleet: Option<(FleetService, Reconciler)>,
     telemetry: Option<TelemetryService>,
@@ -56,11 +56,11 @@ pub struct Server {
 
 impl Server {
     /// Builds the services; nothing runs yet. They end some time after `stop`.
-    pub fn new(parts: Parts, stop: CancellationToken) -> Boxed<'static, anyhow::Result<Self>> {
+    pub fn new(parts: Components, stop: CancellationToken) -> Boxed<'static, anyhow::Result<Self>> {
         Box::pin(Self::build(parts, stop))
     }
 
-    async fn build(mut parts: Parts, stop: CancellationToken) -> anyhow::Result<Self> {
+    async fn build(mut parts: Components, stop: CancellationToken) -> anyhow::Result<Self> {
         parts.ota = parts.ota.with_rows(parts.store.clone());
         parts.reader = parts.reader.map(|reader| reader.with_rows(parts.store.clone()));
         let board: Arc<LiveBoard<Live>> = LiveBoard::new();
@@ -222,10 +222,10 @@ impl Server {
         if self.parts.identity.is_none() {
             names.retain(|name| !Role::Identity.services().contains(name));
         }
-        let readiness = tell(&health, names, self.ready.subscribe());
+        let readiness = publish_health(&health, names, self.ready.subscribe());
         let ending = end(stop.clone(), shutdown.clone(), self.parts.drain, self.telemetry.clone(), self.ready.clone());
         let following = follow(&self.parts, self.board.clone());
-        let keeper = upkeep::run(&self.parts, self.task.clone());
+        let keeper = housekeeping::run(&self.parts, self.task.clone());
         let failure = OnceLock::new();
         let services = async {
             let services = Running {
@@ -266,7 +266,7 @@ impl Server {
     }
 }
 
-async fn open_task(parts: &Parts, shutdown: &CancellationToken) -> anyhow::Result<TaskService> {
+async fn open_task(parts: &Components, shutdown: &CancellationToken) -> anyhow::Result<TaskService> {
     let task = midshift_task::Parts {
         store: parts.store.clone(),
         site: parts.site.clone(),
@@ -282,7 +282,7 @@ struct Running<'p> {
     planner: Option<Planner>,
     telemetry: Option<TelemetryService>,
     beacons: Option<UdpSocket>,
-    parts: &'p Parts,
+    parts: &'p Components,
 }
 
 impl Running<'_> {
@@ -378,7 +378,7 @@ async fn changed(watched: &mut Option<watch::Receiver<bool>>) -> bool {
 }
 
 /// Reads what other gateways hear, if there may be any.
-async fn follow(parts: &Parts, board: Arc<LiveBoard<Live>>) {
+async fn follow(parts: &Components, board: Arc<LiveBoard<Live>>) {
     match parts.heard.clone() {
         Some(heard) => midshift_store::follow_heard(heard, board, parts.clock.clone()).await,
         None => std::future::pending().await,
@@ -411,7 +411,7 @@ async fn spawned<E: std::error::Error + Send + Sync + 'static>(
 }
 
 /// Keeps health as the process is ready or not, for each of its services.
-async fn tell(health: &HealthReporter, names: BTreeSet<&'static str>, mut ready: watch::Receiver<bool>) {
+async fn publish_health(health: &HealthReporter, names: BTreeSet<&'static str>, mut ready: watch::Receiver<bool>) {
     loop {
         let status = if *ready.borrow_and_update() { ServingStatus::Serving } else { ServingStatus::NotServing };
         for name in &names {
@@ -450,11 +450,11 @@ mod tests {
     }
 
     /// A server of every role in memory, without login.
-    pub fn parts(planning: &Planning) -> anyhow::Result<Parts> {
+    pub fn parts(planning: &Planning) -> anyhow::Result<Components> {
         let loaded = site_file::load(None, None, None)?;
         let clock = clock::clock(1000);
         let store_id = StoreId(Arc::from("store-1"));
-        Ok(Parts {
+        Ok(Components {
             roles: Roles::default(),
             drain: Duration::ZERO,
             heard: None,

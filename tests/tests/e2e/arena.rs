@@ -8,9 +8,9 @@ use crate::harness::{Server, folder, until};
 use crate::room::LIMIT;
 use crate::stack::page;
 use anyhow::{Context, ensure};
-use midshift::machines::Machines;
+use midshift::enrol_simulated::{Machines, Replaced};
+use midshift_cli::endpoint::Line;
 use midshift_cli::task_list::request;
-use midshift_cli::way::Line;
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::site::{DEMO, Site, text};
 use midshift_core::time::Clock;
@@ -116,7 +116,8 @@ impl Arena {
         };
         let hall = Arc::new(Fleet::open(&of_hall, &clock.now())?);
         let ids: Vec<RobotId> = hall.robots().iter().map(|robot| robot.robot_id().clone()).collect();
-        let machines = Machines::enrol(&server.way()?, &server.address.to_string(), ids, None).await?;
+        let machines =
+            Machines::enrol(&server.way()?, &server.address.to_string(), ids, None, &Replaced::default()).await?;
         let uri = format!("https://{}", server.address);
         let swarm = SwarmConfig::over(hall.clone(), clock.clone(), &uri, Arc::new(machines.tls()), seed);
         let swarm = Swarm::new(SwarmConfig { person: None, ..swarm });

@@ -18,7 +18,7 @@ const CUT_MS: i64 = 20_000;
 const SLEW_MS: i64 = 500;
 const CUT: [&str; 5] = ["rbt-01", "rbt-02", "rbt-03", "rbt-04", "rbt-05"];
 
-async fn events(client: &mut TelemetryServiceClient<midshift_cli::way::Line>) -> anyhow::Result<Vec<Event>> {
+async fn events(client: &mut TelemetryServiceClient<midshift_cli::endpoint::Line>) -> anyhow::Result<Vec<Event>> {
     let robot_ids = CUT.map(str::to_owned).to_vec();
     let (mut all, mut cursor) = (Vec::new(), String::new());
     loop {
@@ -44,7 +44,7 @@ fn newest(events: &[Event]) -> BTreeMap<String, u64> {
 }
 
 /// Whether the server misses each of them at this moment.
-async fn are_missed(client: &mut TelemetryServiceClient<midshift_cli::way::Line>) -> anyhow::Result<bool> {
+async fn are_missed(client: &mut TelemetryServiceClient<midshift_cli::endpoint::Line>) -> anyhow::Result<bool> {
     let filter = RobotFilter { robot_ids: CUT.map(str::to_owned).to_vec(), ..RobotFilter::default() };
     let request = ListRobotsRequest { filter: Some(filter), page_size: 100, page_token: String::new() };
     let robots = client.list_robots(request).await?.into_inner().robots;

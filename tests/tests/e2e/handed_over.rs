@@ -3,7 +3,7 @@
 
 use crate::harness::{Server, channel, folder};
 use anyhow::{Context, ensure};
-use midshift::machines::Machines;
+use midshift::enrol_simulated::{Machines, Replaced};
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_agent::tls::Tls;
 use midshift_core::ids::RobotId;
@@ -154,7 +154,7 @@ async fn a_thousand_hand_overs_of_enrolled_robots_raise_no_alarm_and_one_copied_
     let server = Server::start(dir.path()).await?;
     let address = server.address;
     let robots = (0..=ROBOTS).map(|n| RobotId::parse(&format!("r{n}"))).collect::<Result<Vec<_>, _>>()?;
-    let machines = Machines::enrol(&server.way()?, &address.to_string(), robots, None).await?;
+    let machines = Machines::enrol(&server.way()?, &address.to_string(), robots, None, &Replaced::default()).await?;
     let mut tls = machines.tls();
     let (copied, copied_tls) = tls.pop_first().context("a robot more than those that go over")?;
     let mut joined = JoinSet::new();

@@ -3,7 +3,7 @@
 use crate::engine::fresh_store;
 use crate::secrets::{keep_keys, keep_secret, secret_part, told_by_log};
 use anyhow::{Context, bail, ensure};
-use midshift_cli::way::{Line, Way};
+use midshift_cli::endpoint::{Endpoint, Line};
 use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::identity::v1::CreateTokenRequest;
 use midshift_proto::identity::v1::identity_service_client::IdentityServiceClient;
@@ -188,7 +188,7 @@ struct Known {
     token: String,
     /// Of somebody else, who may approve what the first one wrote.
     second: String,
-    way: Way,
+    way: Endpoint,
 }
 
 /// By address. What is not here is spoken to in plain text.
@@ -215,7 +215,7 @@ pub async fn sign_in_to(address: SocketAddr, authority: PathBuf, token: &Path) -
         Ok(token.ends_with('\n').then(|| token.trim().to_owned()))
     });
     let token = token.await?;
-    let way = Way::secure(&address.to_string(), &std::fs::read_to_string(&authority)?, Some(&token))?;
+    let way = Endpoint::secure(&address.to_string(), &std::fs::read_to_string(&authority)?, Some(&token))?;
     let identity = IdentityServiceClient::new(way.lazy());
     let grants = vec!["ota-approver".to_owned()];
     let request = CreateTokenRequest { name: "second".to_owned(), grants, valid_seconds: 86_400, ..Default::default() };
@@ -245,7 +245,7 @@ pub fn approver(address: SocketAddr) -> Option<String> {
 /// Another port of the site that `of` is known for.
 pub fn same_site(of: SocketAddr, port: SocketAddr) -> anyhow::Result<()> {
     let Some(site) = known(of) else { return Ok(()) };
-    let way = Way::secure(&port.to_string(), &std::fs::read_to_string(&site.authority)?, Some(&site.token))?;
+    let way = Endpoint::secure(&port.to_string(), &std::fs::read_to_string(&site.authority)?, Some(&site.token))?;
     KNOWN.lock().unwrap_or_else(PoisonError::into_inner).insert(port, Known { way, ..site });
     Ok(())
 }
@@ -393,7 +393,7 @@ impl Server {
         channel(self.address)
     }
     /// The way there, signed in; only of a site with a login.
-    pub fn way(&self) -> anyhow::Result<Way> {
+    pub fn way(&self) -> anyhow::Result<Endpoint> {
         known(self.address).map(|site| site.way).context("the site has no login")
     }
     /// A client of the service of tasks.
@@ -433,6 +433,6 @@ pub fn channel(address: SocketAddr) -> anyhow::Result<Line> {
 }
 
 /// The way to an address, over TLS and signed in if the site has a login.
-pub fn way(address: SocketAddr) -> anyhow::Result<Way> {
-    known(address).map_or_else(|| Way::plain(&address.to_string()), |site| Ok(site.way))
+pub fn way(address: SocketAddr) -> anyhow::Result<Endpoint> {
+    known(address).map_or_else(|| Endpoint::plain(&address.to_string()), |site| Ok(site.way))
 }

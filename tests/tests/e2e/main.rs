@@ -57,6 +57,7 @@ mod rolled_out;
 mod rolling;
 mod room;
 mod secrets;
+mod simulated;
 mod split;
 mod split_held;
 mod split_restored;

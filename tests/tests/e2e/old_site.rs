@@ -8,12 +8,12 @@ use crate::room::LIMIT;
 use anyhow::{Context, ensure};
 use midshift::backup::{Access, Places, back_up, restore, verify};
 use midshift::clock::{at, clock};
+use midshift::dev::task_summary;
+use midshift::dev::throwaway::Throwaway;
 use midshift::door;
 use midshift::planning::Planning;
-use midshift::server::{Naive, Parts, Server};
+use midshift::server::{Components, Naive, Server};
 use midshift::storage::{Database, Storage};
-use midshift::tally;
-use midshift::throwaway::Throwaway;
 use midshift_agent::clock::wall;
 use midshift_cli::roles::Roles;
 use midshift_core::rows::Table;
@@ -176,7 +176,7 @@ impl Serving {
         let counted = Counted::over(storage.store());
         let (planning, stop) = (Planning::start()?, CancellationToken::new());
         let (software, ota) = Throwaway::make(clock(1000)).await?;
-        let parts = Parts {
+        let parts = Components {
             roles: Roles::default(),
             drain: Duration::ZERO,
             heard: storage.heard(),
@@ -272,8 +272,8 @@ async fn is_looked_up_by_index(serving: &Serving) -> anyhow::Result<()> {
     }
     ensure!(existing == 1, "a watch begins with what is alive, not with {existing}");
     let watched = serving.counted.take();
-    let before = tally::newest(&*serving.counted).await?;
-    let of_others = tally::settle(serving.counted.clone(), "dev-", before).await?.of_others();
+    let before = task_summary::newest_number(&*serving.counted).await?;
+    let of_others = task_summary::read_once(serving.counted.clone(), "dev-", before).await?.of_others();
     ensure!(of_others == 1, "a run's client knows of what is alive, not of {of_others}");
     let tallied = serving.counted.take();
     let read = [

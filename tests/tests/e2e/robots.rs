@@ -4,7 +4,7 @@ use crate::harness::{Running, channel, has_login, midshift, sign_in, until, way}
 use crate::secrets::{keep_key, keep_secret, secret_part};
 use crate::stack::{machines_of, tell_identity};
 use anyhow::Context;
-use midshift::machines::Machines;
+use midshift::enrol_simulated::{Machines, Replaced};
 use midshift_agent::device::DeviceKey;
 use midshift_agent::enrolment::enrol;
 use midshift_agent::ledger::Ledger;
@@ -71,7 +71,8 @@ impl Robots {
         // First all of them are enrolled: one that works before another is heard may be sent to where that one stands.
         let ids = (0..count).map(|number| RobotId::parse(&robot_id(number))).collect::<Result<Vec<_>, _>>()?;
         if has_login(public) {
-            Machines::enrol(&way(public)?, &machines_of(server).to_string(), ids, Some(dir)).await?;
+            Machines::enrol(&way(public)?, &machines_of(server).to_string(), ids, Some(dir), &Replaced::default())
+                .await?;
         }
         for number in 0..count {
             robots.start_one(number, None)?;

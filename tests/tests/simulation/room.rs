@@ -13,7 +13,7 @@ use crate::observer::Shared;
 use crate::software::Software;
 use crate::stops::Stops;
 use crate::wall::ServerWall;
-use midshift::server::{Parts, Server};
+use midshift::server::{Components, Server};
 use midshift_agent::body::Body;
 use midshift_agent::bugs::Bugs;
 use midshift_agent::memory::MemoryStore as RobotMemory;
@@ -315,7 +315,7 @@ fn serve(
             loop {
                 let clock = wall.boot();
                 let ota = software.open(clock.clone()).await?;
-                let parts = Parts {
+                let parts = Components {
                     stop_port: None,
                     jumped_before: None,
                     roles: Roles::default(),

@@ -21,6 +21,17 @@ pub const KEYS: &str = "ota-keys";
 /// Name of the part of rows in PostgreSQL. A backup without it has rows of SQLite.
 pub const POSTGRES: &str = "postgresql";
 
+/// Where a server keeps what is durable.
+#[derive(Clone, Debug)]
+pub struct Places {
+    /// Its data directory.
+    pub data: PathBuf,
+    /// The folder of its online keys, if it has any.
+    pub ota_keys: Option<PathBuf>,
+    /// The database of its rows; none: they are files of SQLite in the data directory.
+    pub store: Option<PostgresConfig>,
+}
+
 /// What parts that were copied tell those after them.
 #[derive(Debug, Default)]
 pub struct Said {

@@ -49,7 +49,7 @@ impl Used {
         let dir = tempfile::tempdir().expect("a folder");
         let (store, frames) = open(&dir.path().join("data")).await;
         let used = Self { dir, store, frames };
-        used.put("a").await;
+        used.write_row("a").await;
         let frame = Frame {
             robot_id: midshift_core::ids::RobotId::parse("r-1").expect("a robot"),
             ring: Arc::from("ring"),
@@ -60,7 +60,7 @@ impl Used {
         used.frames.append(vec![frame]).await.expect("kept");
         used
     }
-    async fn put(&self, id: &str) {
+    async fn write_row(&self, id: &str) {
         let key = Key::new(Table::Attempt, id);
         let write = Write::Put { body: Arc::from("{}"), index: Index::default() };
         let change = RowChange { key, expect: Expect::Absent, write, kind: "attempt.put" };
@@ -83,7 +83,7 @@ impl Used {
 async fn what_is_restored_is_the_moment_of_the_copy_in_a_store_of_its_own() {
     let used = Used::new().await;
     let backup = used.backed_up().await;
-    used.put("later").await;
+    used.write_row("later").await;
     let summary = verify(&backup).await.expect("it is good");
     assert_eq!((summary.site_id.as_str(), summary.begun), ("north", NOW));
     let names: Vec<&str> = summary.parts.iter().map(|(name, ..)| name.as_str()).collect();

@@ -53,13 +53,13 @@ pub struct Restore {
 }
 
 /// Copies everything durable of a server, and prints a summary of the copy.
-pub async fn take(args: &Take, out: &Out) -> Result<(), Exit> {
+pub async fn back_up(args: &Take, out: &Out) -> Result<(), Exit> {
     let from = Places { data: args.data.clone(), ota_keys: args.ota_keys.clone(), store: args.database.postgres()? };
     let summary = backup::back_up(&from, &args.to, clock::clock(1000).now().wall).await?;
     show(&summary, None, out)?;
     // The backup is whole, whether or not that can be said.
     if let Err(error) = backup::told::leave_note(&from.data, &summary, &args.to) {
-        out.say(&format!("warning: the audit will have no row of this backup: {error:#}"));
+        out.inform(&format!("warning: the audit will have no row of this backup: {error:#}"));
     }
     out.next(&format!("midshift restore --verify --from {}", word(&args.to.to_string_lossy())));
     Ok(())
@@ -69,7 +69,7 @@ pub async fn take(args: &Take, out: &Out) -> Result<(), Exit> {
 pub async fn restore(args: &Restore, out: &Out) -> Result<(), Exit> {
     let Some(data) = args.data.clone() else {
         if args.database.store.is_some() {
-            out.say("--verify reads the backup only and asks no database");
+            out.inform("--verify reads the backup only and asks no database");
         }
         return show(&backup::verify(&args.from).await?, None, out);
     };
@@ -77,13 +77,13 @@ pub async fn restore(args: &Restore, out: &Out) -> Result<(), Exit> {
     let access = Access { revocations: args.revocations.clone(), identity: args.identity };
     let (summary, settled) = backup::restore(&args.from, &to, &access, clock::clock(1000).now().wall).await?;
     if let Err(error) = backup::told::leave_restored(&to.data, &args.from, &access, &settled) {
-        out.say(&format!("warning: the audit will have no row of this restore: {error:#}"));
+        out.inform(&format!("warning: the audit will have no row of this restore: {error:#}"));
     }
     show(&summary, Some(&settled), out)?;
-    who_is_let_in(&access, &settled).iter().for_each(|line| out.say(line));
+    who_is_let_in(&access, &settled).iter().for_each(|line| out.inform(line));
     let keys = summary.has_keys().then(|| to.ota_keys.clone().unwrap_or_else(|| to.data.join(KEYS)));
     let (note, command) = serve(&to.data, args.database.store.as_deref(), keys.as_deref());
-    note.iter().for_each(|note| out.say(note));
+    note.iter().for_each(|note| out.inform(note));
     out.next(&command);
     Ok(())
 }
@@ -169,7 +169,7 @@ fn show(summary: &Summary, settled: Option<&Settled>, out: &Out) -> Result<(), E
                 .map(|(name, files, bytes)| vec![name.clone(), files.to_string(), bytes.to_string()])
                 .collect();
             out.line(&columns(&["PART", "FILES", "BYTES"], &rows));
-            out.say(&format!("site {}, begun {begun}", summary.site_id));
+            out.inform(&format!("site {}, begun {begun}", summary.site_id));
             if let Some(secret) = settled.and_then(|settled| settled.secret.as_ref()) {
                 out.line(&format!(
                     "A token that may do everything on this site, for a year. It is shown once:\n\n  {secret}\n"

@@ -85,7 +85,7 @@ fn access(user: &str) -> String {
 fn pair(args: &Pair, out: &Out) -> anyhow::Result<()> {
     let done = args.client_out.join("root.crt");
     if done.exists() {
-        out.say(&format!("{} is there already: nothing is changed", done.display()));
+        out.inform(&format!("{} is there already: nothing is changed", done.display()));
         return Ok(());
     }
     let (issuer, root) = throwaway().context("making an authority")?;
@@ -102,15 +102,15 @@ fn pair(args: &Pair, out: &Out) -> anyhow::Result<()> {
         Ok((params.signed_by(&key, &issuer)?.pem(), key.serialize_pem()))
     };
     let (chain, key) = sign(server).context("signing for the server")?;
-    put(&args.server_out.join("server.key"), &key, 0o600)?;
-    put(&args.server_out.join("server.crt"), &chain, 0o644)?;
-    put(&args.server_out.join("pg_hba.conf"), &access(&args.user), 0o644)?;
-    put(&args.server_out.join("root.crt"), &root, 0o644)?;
+    write_file(&args.server_out.join("server.key"), &key, 0o600)?;
+    write_file(&args.server_out.join("server.crt"), &chain, 0o644)?;
+    write_file(&args.server_out.join("pg_hba.conf"), &access(&args.user), 0o644)?;
+    write_file(&args.server_out.join("root.crt"), &root, 0o644)?;
     let (chain, key) = sign(client).context("signing for midshift")?;
-    put(&args.client_out.join("client.key"), &key, 0o640)?;
-    put(&args.client_out.join("client.crt"), &chain, 0o644)?;
+    write_file(&args.client_out.join("client.key"), &key, 0o640)?;
+    write_file(&args.client_out.join("client.crt"), &chain, 0o644)?;
     // The last one: whoever finds it finds all of them.
-    put(&done, &root, 0o644)?;
+    write_file(&done, &root, 0o644)?;
     out.line(&args.server_out.display().to_string());
     out.line(&args.client_out.display().to_string());
     Ok(())
@@ -133,7 +133,7 @@ fn named(common: &str) -> DistinguishedName {
 }
 
 /// Writes a file anew; what was left there by a call that did not come to its end goes.
-fn put(path: &Path, text: &str, mode: u32) -> anyhow::Result<()> {
+fn write_file(path: &Path, text: &str, mode: u32) -> anyhow::Result<()> {
     let written = midshift_durable::replace_with(path, text.as_bytes(), mode);
     written.with_context(|| format!("writing {}", path.display()))
 }
@@ -163,7 +163,7 @@ async fn get(args: Get, stop: CancellationToken, out: &Out) -> Result<(), Exit> 
     if is_new {
         let days = limits::SERVER_CERTIFICATE_VALID.as_ms() / 86_400_000;
         out.line(&file.display().to_string());
-        out.say(&format!(
+        out.inform(&format!(
             "good for {days} days, renewed by the same command once half of them are over; what reads it must be told then. The site's root is in {PUBLIC_FILE} beside it"
         ));
     }

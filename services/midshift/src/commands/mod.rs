@@ -2,26 +2,26 @@
 
 mod backup;
 mod certificate;
+mod interrupts;
 mod sim;
 mod stop;
 
+use crate::components::Naive;
 use crate::dev::Dev;
-use crate::parts::Naive;
 use crate::robots::AgentRun;
 use crate::serve::Serve;
 use crate::storage::Database;
 use crate::{dev, logs, robots, serve};
 use clap::{Parser, Subcommand};
+use interrupts::interrupts;
 use midshift_agent::core::ExitReason;
 use midshift_agent::launcher::{self, ENVIRONMENT, SWITCHED};
-use midshift_agent::program::told_to_end;
 use midshift_agent::{environment, launcher_heartbeat};
 use midshift_cli::client::Exit;
 use midshift_cli::out::{Format, Out, Output};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
-use tokio_util::sync::CancellationToken;
 
 /// What it says of itself. A program that was built for tests has their naive rules in it and says so: none is ever released.
 const VERSION: &str = if Naive::ARE_BUILT_IN {
@@ -116,7 +116,7 @@ pub fn main() -> ExitCode {
     {
         // Nobody would start this agent again, or kill it if it hung.
         let gone = Exit::new(ENVIRONMENT, format!("the launcher that started this agent is not there: {error}"));
-        return gone.report(&Out::of(args.output));
+        return gone.report(&Out::for_output(args.output));
     }
     let serves = match &args.command {
         Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run { .. }) => true,
@@ -124,7 +124,7 @@ pub fn main() -> ExitCode {
         _ => false,
     };
     logs::start(args.log, if serves { "info" } else { "warn" });
-    let out = Out::of(args.output);
+    let out = Out::for_output(args.output);
     let makes_page = matches!(&args.command, Command::Client(command) if command.makes_page());
     if out.is_page() && !makes_page {
         return Exit::usage("only `midshift rollout report` makes a page\n  try: -o json").report(&out);
@@ -146,23 +146,12 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// A token that Ctrl-C and SIGTERM cancel.
-fn interrupts() -> CancellationToken {
-    let stop = CancellationToken::new();
-    let cancel = stop.clone();
-    tokio::spawn(async move {
-        told_to_end().await;
-        cancel.cancel();
-    });
-    stop
-}
-
 async fn run(command: Command, out: &Out) -> Result<(), Exit> {
     match command {
         Command::Dev(args) => develop(*args, out).await,
         Command::Serve(args) => Ok(serve::run(args, interrupts(), &|text| out.line(text)).await?),
         Command::Migrate { data, database } => migrate(&data.unwrap_or_default(), &database, out).await,
-        Command::Backup(args) => backup::take(&args, out).await,
+        Command::Backup(args) => backup::back_up(&args, out).await,
         Command::Restore(args) => backup::restore(&args, out).await,
         Command::Agent(AgentVerb::Run(args)) => match robots::agent(args, interrupts()).await {
             Ok(ExitReason::Switched) => Err(Exit::new(SWITCHED, "another set of software is to be started")),
@@ -171,7 +160,7 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
             Err(error) => Err(error.into()),
         },
         Command::Launcher { .. } => unreachable!("runs before the runtime"),
-        Command::Sim(verb) => sim::run(verb, out, interrupts()).await,
+        Command::Sim(verb) => sim::run(verb, out).await,
         Command::Client(command) => midshift_cli::run(command, out).await,
         Command::Stop(stop) => stop::run(*stop, out).await,
         Command::Certificate(verb) => certificate::run(*verb, interrupts(), out).await,
@@ -180,10 +169,10 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
 
 async fn develop(args: Dev, out: &Out) -> Result<(), Exit> {
     let bounded = args.run_for.is_some() || args.scenario.is_some();
-    let report = dev::run(args, interrupts(), &|text| out.say(text)).await?;
+    let report = dev::run(args, interrupts(), &|text| out.inform(text)).await?;
     let objections = report.objections();
     if bounded {
-        out.say(&format!(
+        out.inform(&format!(
             "{:.0} s of site time in {:.0} s: {} submitted, {} succeeded, {} failed, {} canceled, {} expired, {} to operator, {} open; \
              {:.0} tasks/h, completion p50 {:.0} s p95 {:.0} s, empty {:.0} %, {} exclusion violations (collisions: {})",
             report.site_s,

@@ -3,7 +3,7 @@
 //! Invariant: nothing on the page is typed by hand but the meaning of exit codes, which stands in [`EXIT_CODES`].
 
 use super::Args;
-use clap::{Arg, Command, CommandFactory};
+use clap::{Arg, ArgGroup, Command, CommandFactory};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -79,8 +79,31 @@ fn plain(text: &str) -> String {
     plain
 }
 
-/// What an option is for, what it may be, and what it is when nobody says it.
-fn described(arg: &Arg) -> String {
+/// An argument by its name in a sentence.
+fn named(arg: &Arg) -> String {
+    arg.get_long().map_or_else(|| format!("`{}`", typed(arg)), |long| format!("`--{long}`"))
+}
+
+/// Arguments of a command that `arg` does not go with, by a word of either.
+fn conflicts(command: &Command, arg: &Arg) -> Vec<String> {
+    let excludes = |one: &Arg, other: &Arg| command.get_arg_conflicts_with(one).contains(&other);
+    let others = arguments(command).into_iter().filter(|other| other.get_id() != arg.get_id());
+    others.filter(|other| excludes(arg, other) || excludes(other, arg)).map(named).collect()
+}
+
+/// Groups of arguments of which only one may be there.
+fn choices(command: &Command) -> Vec<String> {
+    let choice = |group: &ArgGroup| {
+        let of_group = arguments(command).into_iter().filter(|arg| group.get_args().any(|id| id == arg.get_id()));
+        let names: Vec<String> = of_group.map(named).collect();
+        let how = if group.is_required_set() { "Exactly one" } else { "At most one" };
+        (names.len() > 1).then(|| format!("{how} of {}.", names.join(", ")))
+    };
+    command.get_groups().filter(|group| !(*group).clone().is_multiple()).filter_map(choice).collect()
+}
+
+/// What an option is for, what it may be, what it is when nobody says it, and what it does not go with.
+fn described(command: &Command, arg: &Arg) -> String {
     let help = arg.get_long_help().or_else(|| arg.get_help()).map(|help| plain(&help.to_string()));
     let mut text = help.unwrap_or_default();
     let takes = arg.get_num_args().is_some_and(|n| n.takes_values());
@@ -98,11 +121,15 @@ fn described(arg: &Arg) -> String {
     if arg.is_required_set() {
         text += " Required.";
     }
+    let conflicts = conflicts(command, arg);
+    if !conflicts.is_empty() {
+        let _infallible = write!(text, " Not with {}.", conflicts.join(", "));
+    }
     text.trim_start().to_owned()
 }
 
-fn item(arg: &Arg) -> String {
-    wrapped(format!("- `{}`: {}", typed(arg), described(arg)).trim_end_matches([':', ' ']), "  ")
+fn item(command: &Command, arg: &Arg) -> String {
+    wrapped(format!("- `{}`: {}", typed(arg), described(command, arg)).trim_end_matches([':', ' ']), "  ")
 }
 
 /// Lines of at most [`LINE_MAX`] characters, all but the first behind `indent`; a word that is longer stands alone.
@@ -138,12 +165,12 @@ fn verbs(command: &Command) -> Vec<&Command> {
 /// Counts, over all commands below, the options that are typed and described alike.
 fn count(command: &Command, counted: &mut BTreeMap<String, usize>) {
     for arg in arguments(command).into_iter().filter(|arg| !arg.is_positional()) {
-        *counted.entry(item(arg)).or_default() += 1;
+        *counted.entry(item(command, arg)).or_default() += 1;
     }
     verbs(command).into_iter().for_each(|verb| count(verb, counted));
 }
 
-fn tell(command: &Command, path: &str, depth: usize, shared: &BTreeMap<String, usize>, page: &mut String) {
+fn write_command(command: &Command, path: &str, depth: usize, shared: &BTreeMap<String, usize>, page: &mut String) {
     let _infallible = write!(page, "\n{} midshift {path}\n", "#".repeat(depth));
     let about = command.get_long_about().or_else(|| command.get_about()).map(ToString::to_string).unwrap_or_default();
     for paragraph in about.split("\n\n") {
@@ -151,11 +178,19 @@ fn tell(command: &Command, path: &str, depth: usize, shared: &BTreeMap<String, u
         *page += &wrapped(&plain(paragraph), "");
     }
     let all = arguments(command);
-    let (alike, own): (Vec<&Arg>, Vec<&Arg>) = all.into_iter().partition(|arg| shared.contains_key(&item(arg)));
+    let (alike, own): (Vec<&Arg>, Vec<&Arg>) =
+        all.into_iter().partition(|arg| shared.contains_key(&item(command, arg)));
     if !own.is_empty() {
         *page += "\n";
     }
-    own.iter().for_each(|arg| *page += &item(arg));
+    own.iter().for_each(|arg| *page += &item(command, arg));
+    for choice in choices(command) {
+        *page += "\n";
+        *page += &wrapped(&choice, "");
+    }
+    if command.is_args_conflicts_with_subcommands_set() {
+        *page += "\nIts own options do not go with the commands below it.\n";
+    }
     let alike: Vec<String> = alike
         .into_iter()
         .filter(|arg| !arg.is_global_set())
@@ -179,7 +214,7 @@ fn tell(command: &Command, path: &str, depth: usize, shared: &BTreeMap<String, u
         *page += &wrapped(&format!("Its own exit codes: {}.", ends.join("; ")), "");
     }
     for verb in verbs(command) {
-        tell(verb, &format!("{path} {}", verb.get_name()), depth + 1, shared, page);
+        write_command(verb, &format!("{path} {}", verb.get_name()), depth + 1, shared, page);
     }
 }
 
@@ -199,7 +234,7 @@ fn page() -> String {
     page += "\n## Options of many commands\n\n";
     shared.keys().for_each(|item| page += item);
     for command in verbs(&whole) {
-        tell(command, command.get_name(), 2, &shared, &mut page);
+        write_command(command, command.get_name(), 2, &shared, &mut page);
     }
     page
 }
@@ -243,6 +278,9 @@ fn every_line_of_the_page_is_one_that_people_can_read() {
     let long: Vec<&str> =
         page.lines().filter(|line| !line.starts_with('|') && line.chars().count() > LINE_MAX).collect();
     assert_eq!(long, Vec::<&str>::new());
+    for choice in ["Exactly one of `--all`, `--robot`, `--zone`, `--area`.", "Not with `--pin`."] {
+        assert!(page.contains(choice), "{choice}");
+    }
     for command in
         ["## midshift dev", "### midshift task submit", "### midshift rollout wait", "#### midshift bundle root rotate"]
     {

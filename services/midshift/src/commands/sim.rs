@@ -1,11 +1,11 @@
 //! `midshift sim …`: runs simulated robots, or asks those that run.
 
+use super::interrupts::interrupts;
 use crate::robots::{SimRun, swarm};
 use clap::Subcommand;
 use midshift_cli::client::{Exit, Login};
 use midshift_cli::out::Out;
 use midshift_cli::{Command, sim};
-use tokio_util::sync::CancellationToken;
 
 /// Verbs of the simulator.
 #[derive(Subcommand)]
@@ -24,12 +24,15 @@ pub enum Verb {
 }
 
 /// Runs one verb.
-pub async fn run(verb: Verb, out: &Out, stop: CancellationToken) -> Result<(), Exit> {
+pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
         Verb::Run { run, login } => {
             let resolved = login.resolve(Some(&run.server))?;
-            let way = if resolved.is_secure() { Some(resolved.way(run.identity.address(&run.server))?) } else { None };
-            Ok(swarm(*run, way, stop).await?)
+            let signed_in = match resolved.is_secure() {
+                true => Some([resolved.endpoint(run.identity.address(&run.server))?, resolved.endpoint(&run.server)?]),
+                false => None,
+            };
+            Ok(swarm(*run, signed_in, interrupts()).await?)
         }
         Verb::Ask(verb) => midshift_cli::run(Command::Sim(verb), out).await,
     }

@@ -1,6 +1,6 @@
 //! `midshift stop …`: runs the stop service, checks its files, or asks one that runs.
 
-use super::interrupts;
+use super::interrupts::interrupts;
 use crate::stop::{FOLDER, StopServe};
 use clap::{Args, Subcommand};
 use midshift_cli::Command;

@@ -51,7 +51,7 @@ async fn a_line_that_a_peer_causes_is_written_a_few_times_and_then_counted_and_n
         assert_eq!(written.lines(), vec![begun; limits::FLOOD_LINES as usize], "each robot for itself");
     }
     tokio::time::advance(Duration::from_millis(limits::FLOOD_COUNTED_EVERY.as_ms())).await;
-    counted.counts().iter().for_each(say);
+    counted.counts().iter().for_each(log_count);
     let told = |times: u64, line: &str, of: &str| {
         format!("INFO more of these in the last minute times={times} line=\"{line}\" of=\"{of}\"")
     };

@@ -1,4 +1,5 @@
-//! The way to a server for people, programs and tests: its address, the site's root if it speaks TLS, and the token that is shown with each request.
+//! The endpoint of a server for people, programs and tests: its address, the site's root if it speaks TLS, and the
+//! token that is shown with each request.
 //!
 //! Invariant: a token is sent over TLS alone, and never printed: nothing here has a Debug that shows it.
 
@@ -10,14 +11,15 @@ use std::time::Duration;
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
 use tonic::service::interceptor::InterceptedService;
-use tonic::transport::{Channel, Endpoint};
+use tonic::transport::{self, Channel};
 use tonic::{Request, Status};
 
 pub use midshift_agent::dial::with_scheme;
 
 /// A server that does not answer a connection within this is not there.
 const CONNECT_WITHIN: Duration = Duration::from_secs(3);
-/// A connection with a call under way on which nothing came for so long is asked for a sign of life, and is gone if none comes within [`ALIVE_WITHIN`].
+/// A connection with a call under way on which nothing came for so long is asked for a sign of life, and is gone if
+/// none comes within [`ALIVE_WITHIN`].
 const QUIET: Duration = Duration::from_secs(30);
 const ALIVE_WITHIN: Duration = Duration::from_secs(20);
 
@@ -42,14 +44,14 @@ impl Interceptor for Bearer {
     }
 }
 
-/// The way to one server.
+/// One server, and what is shown to it.
 #[derive(Clone)]
-pub struct Way {
+pub struct Endpoint {
     dial: TcpDial,
     bearer: Bearer,
 }
 
-impl Way {
+impl Endpoint {
     /// To `server` (host:port), in plain text and without a token.
     ///
     /// # Errors
@@ -99,7 +101,8 @@ impl Way {
 }
 
 fn dial(uri: &str) -> anyhow::Result<TcpDial> {
-    let endpoint = Endpoint::from_shared(uri.to_owned()).with_context(|| format!("reading the address {uri}"))?;
+    let endpoint =
+        transport::Endpoint::from_shared(uri.to_owned()).with_context(|| format!("reading the address {uri}"))?;
     let endpoint = endpoint.connect_timeout(CONNECT_WITHIN);
     Ok(TcpDial::over(endpoint.http2_keep_alive_interval(QUIET).keep_alive_timeout(ALIVE_WITHIN), None)?)
 }

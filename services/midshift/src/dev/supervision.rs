@@ -1,31 +1,33 @@
-//! The parts of a run that must last as long as it does, and what it means when one of them does not.
+//! Watches over the tasks of a run that must last as long as it does: one that ends early ends the run with its name
+//! and its error.
 //!
-//! Invariant: a part is waited for once; after [`UnderWay::first_end`] has given an error nothing here is used again. Called by `dev`.
+//! Invariant: a part is waited for once; after [`RunningTasks::first_end`] has given an error nothing here is used
+//! again. Called by `dev`.
 
 use anyhow::{Context, anyhow};
 use tokio::task::{JoinError, JoinHandle};
 
 /// One part, which ends when it is told to.
-pub type Part = JoinHandle<anyhow::Result<()>>;
+pub type Running = JoinHandle<anyhow::Result<()>>;
 
 /// All of them.
-pub struct UnderWay {
+pub struct RunningTasks {
     /// The server.
-    pub serving: Part,
-    /// The picture of tasks.
-    pub following: Part,
+    pub serving: Running,
+    /// The summary of tasks.
+    pub following: Running,
     /// The swarm.
-    pub robots: Part,
+    pub robots: Running,
     /// The client.
-    pub working: Part,
+    pub working: Running,
 }
 
-impl UnderWay {
+impl RunningTasks {
     /// Waits until one of them ends, which none should; why the run is over.
     pub async fn first_end(&mut self) -> anyhow::Error {
         tokio::select! {
             end = &mut self.serving => early("the server", end),
-            end = &mut self.following => early("the picture of tasks", end),
+            end = &mut self.following => early("the summary of tasks", end),
             end = &mut self.robots => early("the robots", end),
             end = &mut self.working => early("the client", end),
         }
@@ -33,7 +35,7 @@ impl UnderWay {
 }
 
 /// The result of a part that was told to end.
-pub async fn ended(part: Part) -> anyhow::Result<()> {
+pub async fn result_of(part: Running) -> anyhow::Result<()> {
     part.await.context("a part of the run broke off")?
 }
 
@@ -47,25 +49,25 @@ fn early(what: &str, end: Result<anyhow::Result<()>, JoinError>) -> anyhow::Erro
 
 #[cfg(test)]
 mod tests {
-    use super::{Part, UnderWay};
+    use super::{Running, RunningTasks};
     use anyhow::bail;
 
-    fn lasts() -> Part {
+    fn lasts() -> Running {
         tokio::spawn(std::future::pending())
     }
 
-    fn all() -> UnderWay {
-        UnderWay { serving: lasts(), following: lasts(), robots: lasts(), working: lasts() }
+    fn all() -> RunningTasks {
+        RunningTasks { serving: lasts(), following: lasts(), robots: lasts(), working: lasts() }
     }
 
     #[tokio::test]
     async fn whichever_part_ends_early_ends_the_run_with_its_name_and_its_error() {
         let fails = || tokio::spawn(async { bail!("the disk is full") });
         let wholes = [
-            (UnderWay { serving: fails(), ..all() }, "the server"),
-            (UnderWay { following: fails(), ..all() }, "the picture of tasks"),
-            (UnderWay { robots: fails(), ..all() }, "the robots"),
-            (UnderWay { working: fails(), ..all() }, "the client"),
+            (RunningTasks { serving: fails(), ..all() }, "the server"),
+            (RunningTasks { following: fails(), ..all() }, "the summary of tasks"),
+            (RunningTasks { robots: fails(), ..all() }, "the robots"),
+            (RunningTasks { working: fails(), ..all() }, "the client"),
         ];
         for (mut whole, name) in wholes {
             let error = format!("{:#}", whole.first_end().await);
@@ -75,7 +77,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_part_that_ends_without_an_error_ends_the_run_too() {
-        let mut whole = UnderWay { robots: tokio::spawn(async { Ok(()) }), ..all() };
+        let mut whole = RunningTasks { robots: tokio::spawn(async { Ok(()) }), ..all() };
         assert_eq!(whole.first_end().await.to_string(), "the robots ended before the run was over, without an error");
     }
 }

@@ -2,7 +2,7 @@
 
 use super::{Inputs, Kind, Report};
 use crate::clock;
-use crate::tally::settle;
+use crate::dev::task_summary::read_once;
 use midshift_core::ids::TaskId;
 use midshift_core::rows::{Item, Writer};
 use midshift_core::site::{DEMO, text};
@@ -71,11 +71,11 @@ async fn run(kind: Kind, site_ms: u64, phases: &[(Phase, usize)]) -> anyhow::Res
 }
 
 async fn report(kind: Kind, site_ms: u64, store: Arc<dyn Store>, acknowledged: Vec<TaskId>) -> anyhow::Result<Report> {
-    Ok(Report::of(Inputs {
+    Ok(Report::from_run(Inputs {
         kind,
         seed: 1,
         acknowledged,
-        tasks: settle(store, RUN, 0).await?,
+        tasks: read_once(store, RUN, 0).await?,
         bodies: bodies()?,
         place_waits: 0,
         no_progress_ms: 0,

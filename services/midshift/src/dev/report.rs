@@ -1,7 +1,7 @@
 //! What a run came to, counted from rows and from the bodies' own journals, never from what was planned.
 
-use crate::scenario::Story;
-use crate::tally::Tasks;
+use crate::dev::scenario::Story;
+use crate::dev::task_summary::Tasks;
 use midshift_core::ids::TaskId;
 use midshift_core::task::Phase;
 use midshift_core::time::Clock;
@@ -71,7 +71,7 @@ pub struct Amounts {
 }
 
 impl Amounts {
-    fn of(kind: Kind, robots: u64, submitted: u64, site_ms: u64) -> Self {
+    fn for_run(kind: Kind, robots: u64, submitted: u64, site_ms: u64) -> Self {
         let long = site_ms >= AMOUNTS_FROM_MS;
         let feeds = kind.built_in && kind.own_backlog && robots <= BUILT_IN_ROBOTS;
         Self {
@@ -191,7 +191,7 @@ pub struct Inputs {
 
 impl Report {
     /// Adds everything up.
-    pub fn of(i: Inputs) -> Self {
+    pub fn from_run(i: Inputs) -> Self {
         let is = |wanted: &[Phase]| i.tasks.count(|p| wanted.contains(&p));
         let six = [
             is(&[Phase::Succeeded]),
@@ -233,7 +233,7 @@ impl Report {
             site_s,
             wall_s,
             achieved_speedup: site_s / wall_s.max(1e-9),
-            asked: Amounts::of(i.kind, i.bodies.robots as u64, submitted, i.site_ms),
+            asked: Amounts::for_run(i.kind, i.bodies.robots as u64, submitted, i.site_ms),
             bodies: i.bodies,
             story: i.story,
         }

@@ -1,11 +1,12 @@
-//! What every process takes care of now and then: old rows, entries and frames of its roles, the chains of the audit, and samples of histograms.
+//! Housekeeping of every process: prunes old rows, entries and frames of its roles, tends the chains of the audit,
+//! folds samples of histograms.
 //!
-//! Which of it goes when is in [`midshift_core::privacy::KEPT`]. Called by [`crate::server`]. Invariant: nothing goes that a service has not consumed,
-//! unless it has not been there for a month.
+//! Which of it goes when is in [`midshift_core::privacy::KEPT`]. Called by [`crate::server`]. Invariant: nothing goes
+//! that a service has not consumed, unless it has not been there for a month.
 
 mod oldest;
 
-use crate::parts::Parts;
+use crate::components::Components;
 use crate::recorder;
 use metrics_exporter_prometheus::PrometheusHandle;
 use midshift_cli::roles::Role;
@@ -29,7 +30,7 @@ const FOLD_EVERY: Duration = Duration::from_secs(5);
 const ENTRIES_MAX: u64 = 20_000_000;
 
 /// Until it is dropped.
-pub async fn run(parts: &Parts, task: Option<TaskService>) {
+pub async fn run(parts: &Components, task: Option<TaskService>) {
     tokio::join!(prune(parts, task), fold(recorder::handle()), keep_audit(parts));
 }
 
@@ -43,13 +44,14 @@ async fn fold(metrics: Option<PrometheusHandle>) {
     }
 }
 
-/// Takes old rows, entries and frames away, entries never past what fleet and roll-outs have not consumed, and tells how old the rest is.
-async fn prune(parts: &Parts, task: Option<TaskService>) {
+/// Takes old rows, entries and frames away, entries never past what fleet and roll-outs have not consumed, and tells
+/// how old the rest is.
+async fn prune(parts: &Components, task: Option<TaskService>) {
     let (store, frames, clock) = (parts.store.as_ref(), parts.frames.as_ref(), parts.clock.as_ref());
     loop {
         tokio::time::sleep(PRUNE_EVERY).await;
         let turn = Turn { store, frames, clock, task: task.as_ref() };
-        turn.take(|role| parts.roles.has(role)).await;
+        turn.prune_all(|role| parts.roles.has(role)).await;
         if let Err(error) = oldest::publish_ages(store, frames, clock).await {
             tracing::warn!(%error, "how old the oldest rows are cannot be read");
         }
@@ -70,7 +72,7 @@ pub struct Turn<'t> {
 
 impl Turn<'_> {
     /// Takes away what the services of this process keep too long. What fails is told, and done another time.
-    pub async fn take(&self, has: impl Fn(Role) -> bool) {
+    pub async fn prune_all(&self, has: impl Fn(Role) -> bool) {
         let (store, frames, clock) = (self.store, self.frames, self.clock);
         if let Some(task) = self.task
             && let Err(error) = task.prune().await
@@ -111,7 +113,7 @@ impl Turn<'_> {
 }
 
 /// Lets the chains of this process' services quote the others each hour, and end where they are old.
-async fn keep_audit(parts: &Parts) {
+async fn keep_audit(parts: &Components) {
     let of_roles = [
         (Role::Task, Writer::Task),
         (Role::Fleet, Writer::Fleet),
@@ -143,8 +145,9 @@ async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), Error
     store.prune(keep).await.map(drop)
 }
 
-/// Whether whoever moved this mark is gone, or will not read on from it: the first entry behind it is older than anything about what is gone is
-/// kept, or gone itself. A process of roll-outs that comes back reads the rows, and the log from its oldest entry on.
+/// Whether whoever moved this mark is gone, or will not read on from it: the first entry behind it is older than
+/// anything about what is gone is kept, or gone itself. A process of roll-outs that comes back reads the rows, and the
+/// log from its oldest entry on.
 async fn is_abandoned(store: &dyn Store, mark: Seq, wall: Utc) -> Result<bool, Error> {
     let page = match store.feed(mark, &Log::ALL, 1).await {
         Err(Error::CursorExpired { asked, oldest }) => return Ok(asked < oldest),

@@ -34,7 +34,7 @@ impl Naive {
 }
 
 /// What a server is built from.
-pub struct Parts {
+pub struct Components {
     /// Which services it has.
     pub roles: Roles,
     /// How long robots have to move to another gateway before this one ends; zero: there is no other.

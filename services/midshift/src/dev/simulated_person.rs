@@ -23,8 +23,8 @@ fn silences(board: &LiveBoard<Live>) -> BTreeSet<StopId> {
     standing.filter(is_silence).collect()
 }
 
-/// The person's rounds; ends only by being dropped.
-pub async fn rounds(board: Arc<LiveBoard<Live>>, channel: Channel) -> Infallible {
+/// Resumes in each round the robots that stand in silence; ends only by being dropped.
+pub async fn resume_silenced(board: Arc<LiveBoard<Live>>, channel: Channel) -> Infallible {
     let mut client = TaskServiceClient::new(channel);
     loop {
         tokio::time::sleep(ROUND).await;

@@ -299,7 +299,7 @@ impl Stage {
             Err(_) => self.until(&rollout_id, has_ended).await?,
         };
         let (seen, most) = watcher.seen().await;
-        self.judge(release, &rollout, &before, Played::of(seen, most, wall_s)).await
+        self.judge(release, &rollout, &before, Played::from_seen(seen, most, wall_s)).await
     }
 
     /// The roll-out, as soon as it is so.

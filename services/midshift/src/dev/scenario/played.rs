@@ -93,7 +93,7 @@ impl Story {
 
 impl Played {
     /// What was seen while it was played; the rest is not known yet.
-    pub fn of(seen: Seen, off_work_most: usize, wall_s: f64) -> Self {
+    pub fn from_seen(seen: Seen, off_work_most: usize, wall_s: f64) -> Self {
         let Seen { areas, may_at_once, broken } = seen;
         Self { off_work_most, off_work_allowed: may_at_once, areas, budget_broken: broken, wall_s, ..Self::default() }
     }

@@ -150,7 +150,7 @@ impl World {
         self.latch.forget(self.wall.now().wall, midshift_core::limits::RESETS_MAX);
         self.copy_stops().await;
         let (store, frames, clock) = (self.store.as_ref(), self.frames.as_ref(), self.wall.as_ref());
-        Turn { store, frames, clock, task: Some(&self.task) }.take(|_| true).await;
+        Turn { store, frames, clock, task: Some(&self.task) }.prune_all(|_| true).await;
         for (writer, _) in Table::audits() {
             audit::maintain_chain(store, clock, *writer).await.expect("kept");
         }

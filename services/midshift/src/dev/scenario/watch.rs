@@ -21,8 +21,7 @@ use std::time::Duration;
 use tokio_util::task::AbortOnDropHandle;
 
 /// How often robots and roll-outs are looked at, real time.
-pub(super) const LOOK_EVERY: Duration = Duration::from_millis(200);
-
+pub const LOOK_EVERY: Duration = Duration::from_millis(200);
 /// All rows of a roll-out must be read so long after its end, real time.
 const READ_WITHIN: Duration = Duration::from_secs(30);
 
@@ -79,7 +78,7 @@ impl Watcher {
                         return picture.judge.cannot(format!("rows could not be read: {error}"));
                     }
                     let said = sight.said();
-                    picture.judge.look(sight.clock.now().link, &said);
+                    picture.judge.judge_reports(sight.clock.now().link, &said);
                     picture.most = picture.most.max(said.iter().filter(|s| s.changes || s.goes_back).count());
                     picture.seq = rows.seq();
                 }
@@ -104,7 +103,7 @@ impl Watcher {
             let (seq, within) = (picture.seq.0, READ_WITHIN.as_secs());
             picture.judge.cannot(format!("rows were read up to {seq} of {} within {within} s", head.0));
         }
-        (picture.judge.take(), std::mem::take(&mut picture.most))
+        (picture.judge.take_seen(), std::mem::take(&mut picture.most))
     }
 }
 
@@ -144,7 +143,7 @@ impl Fold for Rows {
         match change.key.table {
             Table::Drain => match change.decode::<Drain>()? {
                 Some(drain) => {
-                    judge.hear(self.sight.clock.now().link, &self.sight.said());
+                    judge.note_reports(self.sight.clock.now().link, &self.sight.said());
                     judge.drain(drain);
                 }
                 None => judge.drain_is_gone(&change.key.id),

@@ -78,20 +78,20 @@ impl Tasks {
         took
     }
     /// Takes a row as it became. Tasks are never deleted while a run lasts.
-    fn take(&mut self, row: &Row) -> Result<(), BadRow> {
+    fn apply_row(&mut self, row: &Row) -> Result<(), BadRow> {
         if row.key.table == Table::TaskIntake {
             let intake = row.decode::<TaskIntake>()?;
             let is_own = !self.run.is_empty() && intake.request_id.starts_with(&self.run);
             self.asked.insert(intake.task_id.clone(), Asked { created: intake.created, is_own });
-            self.meet(&intake.task_id);
+            self.note_own(&intake.task_id);
         } else {
             let state = row.decode::<TaskState>()?;
             self.states.insert(state.task_id.clone(), (state.phase, state.ended));
-            self.meet(&state.task_id);
+            self.note_own(&state.task_id);
         }
         Ok(())
     }
-    fn meet(&mut self, id: &TaskId) {
+    fn note_own(&mut self, id: &TaskId) {
         if self.states.contains_key(id) && self.asked.get(id).is_some_and(|a| a.is_own) {
             self.own.insert(id.clone());
         }
@@ -101,8 +101,8 @@ impl Tasks {
 /// The tasks, shared with whoever looks.
 pub type SharedTasks = Arc<Mutex<Tasks>>;
 
-/// Looks at the tasks.
-pub fn look<T>(tasks: &SharedTasks, f: impl FnOnce(&Tasks) -> T) -> T {
+/// Reads something of the tasks under their lock.
+pub fn read_tasks<T>(tasks: &SharedTasks, f: impl FnOnce(&Tasks) -> T) -> T {
     f(&tasks.lock().unwrap_or_else(PoisonError::into_inner))
 }
 
@@ -113,7 +113,7 @@ const TABLES: [Table; 2] = [Table::TaskIntake, Table::TaskState];
 ///
 /// # Errors
 /// If the store cannot be read.
-pub async fn newest(store: &dyn Store) -> Result<u64, Error> {
+pub async fn newest_number(store: &dyn Store) -> Result<u64, Error> {
     let query = Query { newest_first: true, limit: 1, ..Query::all(Table::TaskIntake) };
     Ok(store.list(query).await?.first().map_or(Ok(0), |row| row.decode::<TaskIntake>().map(|intake| intake.number))?)
 }
@@ -121,20 +121,20 @@ pub async fn newest(store: &dyn Store) -> Result<u64, Error> {
 /// Reads the tasks anew: those that are alive, and all that were admitted since the run began.
 /// Tasks that were over by then cost nothing.
 /// Returns where the feed goes on.
-async fn read(store: &dyn Store, tasks: &SharedTasks) -> Result<Seq, Error> {
+async fn read_rows(store: &dyn Store, tasks: &SharedTasks) -> Result<Seq, Error> {
     let live = Phase::ALL.into_iter().filter(|phase| !phase.is_terminal()).map(Phase::number).collect();
     let alive = store.read(&[Part::InStates(Table::TaskState, live)], |_| Vec::new()).await?;
-    let (run, before) = look(tasks, |tasks| (tasks.run.clone(), tasks.before));
+    let (run, before) = read_tasks(tasks, |tasks| (tasks.run.clone(), tasks.before));
     let mut fresh = Tasks::of_run(&run, before);
     for row in &alive.rows {
-        fresh.take(row)?;
+        fresh.apply_row(row)?;
     }
     let mut after = Some(Cursor { order: before.saturating_add(1).cast_signed(), id: Arc::from("") });
     while after.is_some() {
         let intakes = store.list(Query { after, ..Query::all(Table::TaskIntake) }).await?;
         let states = intakes.iter().map(|row| Key { table: Table::TaskState, id: row.key.id.clone() }).collect();
         for row in intakes.iter().chain(&store.get(states).await?) {
-            fresh.take(row)?;
+            fresh.apply_row(row)?;
         }
         after = intakes.last().map(Cursor::of);
     }
@@ -147,14 +147,14 @@ async fn advance(store: &dyn Store, tasks: &SharedTasks, mut seq: Seq) -> Result
     let logs = [Log::Task, Log::Fleet];
     loop {
         let page = match store.feed(seq, &logs, FEED_PAGE_MAX).await {
-            Err(Error::CursorExpired { .. }) => return read(store, tasks).await,
+            Err(Error::CursorExpired { .. }) => return read_rows(store, tasks).await,
             page => page?,
         };
         for entry in page.entries.into_iter().filter(|entry| entry.table.is_some_and(|of| TABLES.contains(&of))) {
             let Some((table, body)) = entry.table.zip(entry.body) else { continue };
             let key = Key { table, id: entry.subject };
             let row = Row { key, revision: entry.revision, index: entry.index, body };
-            tasks.lock().unwrap_or_else(PoisonError::into_inner).take(&row)?;
+            tasks.lock().unwrap_or_else(PoisonError::into_inner).apply_row(&row)?;
         }
         seq = page.next;
         if page.next >= page.head {
@@ -169,7 +169,7 @@ async fn advance(store: &dyn Store, tasks: &SharedTasks, mut seq: Seq) -> Result
 /// If the store cannot be read.
 pub async fn follow(store: Arc<dyn Store>, tasks: SharedTasks, stop: CancellationToken) -> Result<(), Error> {
     let mut wake = store.wake();
-    let mut seq = read(store.as_ref(), &tasks).await?;
+    let mut seq = read_rows(store.as_ref(), &tasks).await?;
     loop {
         wake.mark_unchanged();
         seq = advance(store.as_ref(), &tasks, seq).await?;
@@ -184,9 +184,9 @@ pub async fn follow(store: Arc<dyn Store>, tasks: SharedTasks, stop: Cancellatio
 ///
 /// # Errors
 /// If the store cannot be read.
-pub async fn settle(store: Arc<dyn Store>, run: &str, before: u64) -> Result<Tasks, Error> {
+pub async fn read_once(store: Arc<dyn Store>, run: &str, before: u64) -> Result<Tasks, Error> {
     let tasks = Arc::new(Mutex::new(Tasks::of_run(run, before)));
-    read(store.as_ref(), &tasks).await?;
+    read_rows(store.as_ref(), &tasks).await?;
     let mut tasks = tasks.lock().unwrap_or_else(PoisonError::into_inner);
     Ok(std::mem::take(&mut *tasks))
 }

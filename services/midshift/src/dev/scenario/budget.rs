@@ -111,7 +111,7 @@ impl Judge {
     }
 
     /// What robots say now. To be told before each drain, so that no planner saw more.
-    pub fn hear(&mut self, now: LinkTime, said: &[Said]) {
+    pub fn note_reports(&mut self, now: LinkTime, said: &[Said]) {
         self.now = now;
         for said in said {
             let known = Robot { heard: said.heard, areas: BTreeMap::new(), stuck: None };
@@ -127,8 +127,8 @@ impl Judge {
     }
 
     /// What robots say now; all rows up to this moment were taken before.
-    pub fn look(&mut self, now: LinkTime, said: &[Said]) {
-        self.hear(now, said);
+    pub fn judge_reports(&mut self, now: LinkTime, said: &[Said]) {
+        self.note_reports(now, said);
         self.knows_all = true;
         let is_out = |robot_id: &RobotId| self.on.values().any(|d| d.robot_id == *robot_id);
         let mut suspects = BTreeMap::new();
@@ -195,7 +195,7 @@ impl Judge {
     }
 
     /// What was seen since the last time.
-    pub fn take(&mut self) -> Seen {
+    pub fn take_seen(&mut self) -> Seen {
         let may = std::mem::take(&mut self.may);
         Seen {
             areas: std::mem::take(&mut self.seen).into_values().collect(),

@@ -54,7 +54,7 @@ fn judge() -> Judge {
     let mut judge = Judge::new(BTreeMap::from([(area("hall"), 100), (area("packing"), 100)]));
     judge.rollout(rollout(), Pace::default());
     (0..23).for_each(|number| judge.robot(rollout(), robot(number), 0));
-    judge.look(NOW, &all());
+    judge.judge_reports(NOW, &all());
     judge
 }
 
@@ -66,7 +66,7 @@ fn all() -> Vec<Said> {
 fn each_area_has_a_budget_of_its_own() {
     let mut judge = judge();
     [drain(0, "hall"), drain(1, "hall"), drain(20, "packing")].into_iter().for_each(|d| judge.drain(d));
-    let seen = judge.take();
+    let seen = judge.take_seen();
     assert_eq!(seen.broken, Vec::<String>::new());
     let fullest: Vec<_> = seen.areas.iter().map(|a| (a.area_id.as_str(), a.out, a.may)).collect();
     assert_eq!((fullest, seen.may_at_once), (vec![("hall", 2, 2), ("packing", 1, 1)], 3));
@@ -79,7 +79,7 @@ fn a_robot_that_was_written_off_spends_no_budget_until_it_counts_again() {
     (0..2).for_each(|number| judge.drain(drain(number, "hall")));
     judge.write_off(rollout(), robot(0));
     judge.drain(drain(2, "hall"));
-    assert_eq!(judge.take().broken, Vec::<String>::new());
+    assert_eq!(judge.take_seen().broken, Vec::<String>::new());
     judge.count(&rollout(), &robot(0));
     judge.drain(drain(3, "hall"));
     let names = "(r-00, r-01, r-02, r-03)";
@@ -87,7 +87,7 @@ fn a_robot_that_was_written_off_spends_no_budget_until_it_counts_again() {
         format!("hall: 4 robots were out of work {names}, 2 may be"),
         format!("4 robots were out of work for it at once {names}, 2 may be"),
     ];
-    assert_eq!(judge.take().broken, told);
+    assert_eq!(judge.take_seen().broken, told);
 }
 
 #[test]
@@ -99,7 +99,7 @@ fn one_area_may_not_spend_the_budget_of_another() {
     ] {
         let mut judge = judge();
         numbers.into_iter().for_each(|n| judge.drain(drain(n, from)));
-        assert_eq!(judge.take().broken, [told]);
+        assert_eq!(judge.take_seen().broken, [told]);
     }
 }
 
@@ -110,28 +110,28 @@ fn a_robot_counts_for_the_area_that_it_was_taken_from_until_its_drain_is_no_more
     judge.drain(Drain { state: DrainState::Held, ..drain(20, "packing") });
     // It parks in the hall: there two more may be out, and at packing none.
     let parked = |s: Said| if s.robot_id == robot(20) { said(20, "hall") } else { s };
-    judge.look(NOW, &all().into_iter().map(parked).collect::<Vec<_>>());
+    judge.judge_reports(NOW, &all().into_iter().map(parked).collect::<Vec<_>>());
     [drain(0, "hall"), drain(1, "hall")].into_iter().for_each(|d| judge.drain(d));
-    assert_eq!(judge.take().broken, Vec::<String>::new());
+    assert_eq!(judge.take_seen().broken, Vec::<String>::new());
     judge.drain(drain(21, "packing"));
-    assert_eq!(judge.take().broken.len(), 1);
+    assert_eq!(judge.take_seen().broken.len(), 1);
     judge.drain_is_gone("d-20");
     judge.drain(Drain { state: DrainState::Refused, ..drain(21, "packing") });
     judge.drain(drain(22, "packing"));
-    assert_eq!(judge.take().broken, Vec::<String>::new());
+    assert_eq!(judge.take_seen().broken, Vec::<String>::new());
 }
 
 #[test]
 fn robots_that_left_an_area_a_while_ago_are_no_budget_of_it() {
     let mut judge = judge();
     let left = |from: usize| (0..20).map(|n| said(n, if n < from { "hall" } else { "packing" })).collect::<Vec<_>>();
-    judge.look(LinkTime(NOW.0 + 5_000), &left(19));
+    judge.judge_reports(LinkTime(NOW.0 + 5_000), &left(19));
     [drain(0, "hall"), drain(1, "hall")].into_iter().for_each(|d| judge.drain(d));
-    assert_eq!(judge.take().broken, Vec::<String>::new(), "a planner may have seen the twentieth there");
+    assert_eq!(judge.take_seen().broken, Vec::<String>::new(), "a planner may have seen the twentieth there");
     judge.drain_is_gone("d-01");
-    judge.look(LinkTime(NOW.0 + 10_001), &left(19));
+    judge.judge_reports(LinkTime(NOW.0 + 10_001), &left(19));
     judge.drain(drain(1, "hall"));
-    assert_eq!(judge.take().broken, ["hall: 2 robots were out of work (r-00, r-01), 1 may be"]);
+    assert_eq!(judge.take_seen().broken, ["hall: 2 robots were out of work (r-00, r-01), 1 may be"]);
 }
 
 #[test]
@@ -140,21 +140,21 @@ fn a_way_back_waits_for_drains_alone_that_end_by_themselves_and_an_urgent_one_fo
     let mut waits = judge();
     waits.drain(drain(20, "packing"));
     waits.drain(back(21));
-    assert_eq!(waits.take().broken.len(), 1, "its turn comes when the other is back");
+    assert_eq!(waits.take_seen().broken.len(), 1, "its turn comes when the other is back");
 
     let mut stuck = judge();
     let is_stuck = |s: Said| Said { is_stuck: s.robot_id == robot(20), ..s };
-    stuck.look(NOW, &all().into_iter().map(is_stuck).collect::<Vec<_>>());
+    stuck.judge_reports(NOW, &all().into_iter().map(is_stuck).collect::<Vec<_>>());
     stuck.drain(drain(20, "packing"));
     stuck.drain(back(21));
-    assert_eq!(stuck.take().broken, Vec::<String>::new(), "only a person brings the other back");
+    assert_eq!(stuck.take_seen().broken, Vec::<String>::new(), "only a person brings the other back");
 
     let mut urgent = judge();
     urgent.drain(drain(20, "packing"));
     urgent.drain(Drain { urgent: true, ..back(21) });
-    assert_eq!(urgent.take().broken, Vec::<String>::new());
+    assert_eq!(urgent.take_seen().broken, Vec::<String>::new());
     urgent.drain(drain(22, "packing"));
-    assert_eq!(urgent.take().broken.len(), 1, "it counts for the next");
+    assert_eq!(urgent.take_seen().broken.len(), 1, "it counts for the next");
 }
 
 #[test]
@@ -172,7 +172,7 @@ fn no_more_are_out_of_work_than_the_wave_has_or_the_roll_out_was_asked_for() {
         judge.rollout(rollout(), pace);
         judge.drain(drain(0, "hall"));
         judge.drain(drain(20, "packing"));
-        assert_eq!(judge.take().broken, broken, "{pace:?}, {first_wave} in the first wave");
+        assert_eq!(judge.take_seen().broken, broken, "{pace:?}, {first_wave} in the first wave");
     }
 }
 
@@ -187,13 +187,13 @@ fn software_that_changes_in_no_drain_is_an_objection_at_the_second_heartbeat() {
     inside.drain(drain(3, "hall"));
     let mut outside = judge();
     for judge in [&mut inside, &mut outside] {
-        judge.look(NOW, &heard(NOW));
-        judge.look(later, &heard(NOW));
-        assert_eq!(judge.take().broken, Vec::<String>::new(), "its drain may have ended by an event since");
-        judge.look(later, &heard(later));
+        judge.judge_reports(NOW, &heard(NOW));
+        judge.judge_reports(later, &heard(NOW));
+        assert_eq!(judge.take_seen().broken, Vec::<String>::new(), "its drain may have ended by an event since");
+        judge.judge_reports(later, &heard(later));
     }
-    assert_eq!(inside.take().broken, Vec::<String>::new());
-    assert_eq!(outside.take().broken, ["r-03 changed its software while no drain kept it out of work"]);
+    assert_eq!(inside.take_seen().broken, Vec::<String>::new());
+    assert_eq!(outside.take_seen().broken, ["r-03 changed its software while no drain kept it out of work"]);
 }
 
 #[test]
@@ -201,8 +201,8 @@ fn what_was_there_before_it_looked_is_counted_and_not_judged() {
     let mut judge = judge();
     judge.forget_rows();
     (0..3).for_each(|n| judge.drain(drain(n, "hall")));
-    assert_eq!(judge.take().broken, Vec::<String>::new());
-    judge.look(NOW, &all());
+    assert_eq!(judge.take_seen().broken, Vec::<String>::new());
+    judge.judge_reports(NOW, &all());
     judge.drain(drain(3, "hall"));
-    assert_eq!(judge.take().broken.len(), 1);
+    assert_eq!(judge.take_seen().broken.len(), 1);
 }

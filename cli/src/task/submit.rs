@@ -1,0 +1,199 @@
+//! `midshift task submit`: a transport, or a whole list.
+
+use super::follow::{told_state, until_over};
+use super::shown::show;
+use crate::client::{Call, Change, Exit, unary};
+use crate::out::Out;
+use crate::site_file;
+use crate::task_list::{read_list, request};
+use indicatif::{ProgressBar, ProgressStyle};
+use midshift_core::task::forms::Transport;
+use midshift_proto::task::v1;
+use std::collections::BTreeMap;
+use std::io::IsTerminal;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// What to submit.
+#[derive(clap::Args)]
+pub struct Submit {
+    #[command(flatten)]
+    call: Call,
+    /// Waypoint to pick up at. Without it the robot only drives to --to.
+    #[arg(long, default_value = "")]
+    from: String,
+    /// Waypoint to bring it to.
+    #[arg(long, required_unless_present = "file")]
+    to: Option<String>,
+    /// The item.
+    #[arg(long, default_value = "")]
+    sku: String,
+    /// 0 most urgent .. 9.
+    #[arg(long)]
+    priority: Option<i64>,
+    /// Only this robot.
+    #[arg(long, default_value = "")]
+    robot: String,
+    /// Also if nobody knows a robot that a task names: it waits until that robot comes.
+    #[arg(long)]
+    unknown_robot: bool,
+    /// How long one attempt may take.
+    #[arg(long, value_parser = crate::duration, default_value = "10m")]
+    timeout: Duration,
+    /// How long it may be ready before a robot starts; then a person is asked. Without it as long as it takes.
+    #[arg(long, value_parser = crate::duration)]
+    schedule_to_start: Option<Duration>,
+    /// Attempts after the first.
+    #[arg(long, default_value_t = 3)]
+    retries: i64,
+    /// Your own id for it.
+    #[arg(long, default_value = "")]
+    task_id: String,
+    /// A list instead: .jsonl, .csv, or .tasks of a grid (then with --map).
+    #[arg(long, conflicts_with_all = ["from", "to", "sku", "wait"])]
+    file: Option<PathBuf>,
+    /// The grid map a .tasks list belongs to.
+    #[arg(long)]
+    map: Option<PathBuf>,
+    /// Follow it to its end.
+    #[arg(long)]
+    wait: bool,
+    #[command(flatten)]
+    change: Change,
+}
+
+/// Submits a task, or a list of them.
+pub async fn run(args: Submit, out: &Out) -> Result<(), Exit> {
+    if let Some(path) = &args.file {
+        return submit_list(&args, path, out).await;
+    }
+    let transport = Transport {
+        kind: if args.from.is_empty() { "patrol" } else { "transport" }.to_owned(),
+        priority: args.priority,
+        robot_id: args.robot.clone(),
+        from_waypoint: args.from.clone(),
+        to_waypoint: args.to.clone().unwrap_or_default(),
+        item_sku: args.sku.clone(),
+        timeout_ms: i64::try_from(args.timeout.as_millis()).ok(),
+        max_retry_times: Some(args.retries),
+        retry_interval_ms: None,
+        schedule_to_start_ms: args.schedule_to_start.and_then(|t| i64::try_from(t.as_millis()).ok()),
+    };
+    let mut message = request(&transport);
+    message.request_id = args.change.request_id.clone();
+    message.task_id = args.task_id.clone();
+    message.validate_only = args.change.dry_run;
+    robots_are_known(&args, std::iter::once(&message)).await?;
+    let task = args.call.task().await?.submit_task(unary(message)).await?.into_inner().task.unwrap_or_default();
+    if args.wait && !args.change.dry_run {
+        let told = told_state(&task.task_id, "", &task, out);
+        return until_over(&args.call, &task.task_id, told, Duration::from_secs(86_400), out).await;
+    }
+    if args.change.dry_run {
+        out.inform("valid; nothing was stored");
+    }
+    show(&task, out)?;
+    if !args.change.dry_run {
+        out.next(&format!("midshift task wait {}", task.task_id));
+    }
+    Ok(())
+}
+
+/// Refuses to send tasks for robots that the server does not know: one task of each robot is checked, and nothing is
+/// stored.
+async fn robots_are_known(args: &Submit, tasks: impl IntoIterator<Item = &v1::SubmitTaskRequest>) -> Result<(), Exit> {
+    if args.unknown_robot {
+        return Ok(());
+    }
+    let mut pinned = BTreeMap::new();
+    for task in tasks {
+        let robot = robot_of(task);
+        if !robot.is_empty() {
+            pinned.entry(robot.to_owned()).or_insert(task);
+        }
+    }
+    let mut client = args.call.task().await?;
+    for (robot, task) in pinned {
+        let check = v1::SubmitTaskRequest { validate_only: true, ..task.clone() };
+        let notes = client.submit_task(unary(check)).await?.into_inner().notes;
+        if notes.iter().any(|note| note.code == midshift_core::reason::Code::PinnedRobotUnknown.as_str()) {
+            let text = format!("nobody knows a robot {robot}: it is not enrolled and has never connected");
+            return Err(Exit::new(4, text).or_try("midshift robot ls, or --unknown-robot to submit it all the same"));
+        }
+    }
+    Ok(())
+}
+
+/// The robot that a task names; empty: none.
+fn robot_of(task: &v1::SubmitTaskRequest) -> &str {
+    use v1::submit_task_request::Body;
+    match &task.body {
+        Some(Body::Spec(spec)) => &spec.robot_id,
+        Some(Body::Flat(flat)) => &flat.robot_id,
+        Some(Body::Nested(nested)) => &nested.robot_id,
+        None => "",
+    }
+}
+
+/// Tasks of one call.
+const BURST: usize = 1_000;
+
+async fn submit_list(args: &Submit, path: &std::path::Path, out: &Out) -> Result<(), Exit> {
+    let site = site_file::load(None, args.map.as_deref(), None)?.site;
+    let mut list = read_list(path, &site)?;
+    let run = if args.change.request_id.is_empty() {
+        format!("cli-{:016x}", rand::random::<u64>())
+    } else {
+        args.change.request_id.clone()
+    };
+    for (i, item) in list.iter_mut().enumerate() {
+        item.request_id = format!("{run}-{}", i + 1);
+    }
+    if args.change.dry_run {
+        out.inform(&format!("{} tasks read; nothing was sent", list.len()));
+        return Ok(());
+    }
+    robots_are_known(args, &list).await?;
+    let bar = if std::io::stderr().is_terminal() { ProgressBar::new(list.len() as u64) } else { ProgressBar::hidden() };
+    if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} submitted") {
+        bar.set_style(style);
+    }
+    let mut client = args.call.task().await?;
+    let mut whole = v1::SubmitTasksResponse::default();
+    while !list.is_empty() {
+        let rest = list.split_off(list.len().min(BURST));
+        let items: Vec<_> = std::mem::replace(&mut list, rest)
+            .into_iter()
+            .map(|item| v1::SubmitTasksRequest { item: Some(item) })
+            .collect();
+        let sent = items.len() as u64;
+        whole.results.extend(client.submit_tasks(tokio_stream::iter(items)).await?.into_inner().results);
+        bar.inc(sent);
+    }
+    bar.finish_and_clear();
+    use v1::submit_task_result::Outcome;
+    let refused = whole.results.iter().filter(|r| matches!(r.outcome, Some(Outcome::Refusal(_)))).count();
+    let rows = |r: &v1::SubmitTaskResult| match &r.outcome {
+        Some(Outcome::TaskId(id)) => vec![r.request_id.clone(), id.clone(), String::new()],
+        Some(Outcome::Refusal(refusal)) => {
+            let why = refusal
+                .violations
+                .iter()
+                .map(|v| format!("{}: {}", v.field, v.description))
+                .collect::<Vec<_>>()
+                .join("; ");
+            vec![r.request_id.clone(), "refused".to_owned(), why]
+        }
+        None => vec![r.request_id.clone(), "unknown".to_owned(), String::new()],
+    };
+    out.many(&whole, &whole.results, |r| r.request_id.clone(), &["REQUEST", "TASK", "WHY"], rows)?;
+    out.inform(&format!("{} submitted, {refused} refused", whole.results.len() - refused));
+    if refused > 0 {
+        Err(Exit::new(
+            2,
+            format!("{refused} tasks were refused; mend them and send the list again with --request-id {run}"),
+        ))
+    } else {
+        Ok(())
+    }
+}
