@@ -231,11 +231,11 @@ impl Round<'_> {
         let path = folder.join(format!("{}.log", unit.name.trim_end_matches(':').replace("::", ".")));
         let log = File::create(&path).with_context(|| format!("creating {}", path.display()))?;
         let begun = command.stdout(log.try_clone().context("its output")?).stderr(log).spawn();
-        let ended = run::within(begun.context("starting a test")?, LIMIT, LOOK)?;
+        let succeeded = run::within(begun.context("starting a test")?, LIMIT, LOOK)?;
         let said = String::from_utf8_lossy(&std::fs::read(&path).context("reading what it said")?).into_owned();
         let mut count = Count::default();
         said.lines().for_each(|line| count.add(line));
-        let passed = ended && count.failed == 0 && count != Count::default();
+        let passed = succeeded && count.failed == 0 && count != Count::default();
         if !passed {
             run::print(&format!("---- {}\n{said}", unit.name));
             // A program that was ended has counted nothing.
