@@ -228,21 +228,26 @@ impl Round<'_> {
         }
         command.envs(way.variable).env(PORTS_VARIABLE, format!("{}..{}", ports.start, ports.end));
         self.surround(&mut command)?;
-        let path = folder.join(format!("{}.log", unit.name.trim_end_matches(':').replace("::", ".")));
-        let log = File::create(&path).with_context(|| format!("creating {}", path.display()))?;
-        let begun = command.stdout(log.try_clone().context("its output")?).stderr(log).spawn();
-        let succeeded = run::within(begun.context("starting a test")?, LIMIT, LOOK)?;
-        let said = String::from_utf8_lossy(&std::fs::read(&path).context("reading what it said")?).into_owned();
-        let mut count = Count::default();
-        said.lines().for_each(|line| count.add(line));
-        let passed = succeeded && count.failed == 0 && count != Count::default();
-        if !passed {
-            run::print(&format!("---- {}\n{said}", unit.name));
-            // A program that was ended has counted nothing.
-            count.failed = count.failed.max(1);
-        }
-        Ok((passed, count))
+        let log = format!("{}.log", unit.name.trim_end_matches(':').replace("::", "."));
+        ended(&mut command, &folder.join(log))
     }
+}
+
+/// Runs a test program to its end; whether its tests passed, and which. What it says goes to `log`, and is shown if they did not.
+fn ended(command: &mut Command, log: &Path) -> Result<(bool, Count)> {
+    let file = File::create(log).with_context(|| format!("creating {}", log.display()))?;
+    let begun = command.stdout(file.try_clone().context("its output")?).stderr(file).spawn();
+    let succeeded = run::within(begun.context("starting a test")?, LIMIT, LOOK)?;
+    let said = String::from_utf8_lossy(&std::fs::read(log).context("reading what it said")?).into_owned();
+    let mut count = Count::default();
+    said.lines().for_each(|line| count.add(line));
+    let passed = succeeded && count.failed == 0 && count != Count::default();
+    if !passed {
+        run::print(&format!("---- {}\n{said}", log.display()));
+        // A program that was ended has counted nothing.
+        count.failed = count.failed.max(1);
+    }
+    Ok((passed, count))
 }
 
 /// The test program, where `cargo test` would run it.
@@ -371,6 +376,21 @@ mod tests {
         assert_eq!(shares, [12_000..18_666, 18_666..25_332, 25_332..31_998], "none has a port of another");
         let one_core = queue(&["split::a"], &[], 2);
         assert_eq!(one_core[0].permits, 2, "it takes what there is");
+    }
+
+    #[test]
+    fn what_passed_is_read_off_what_a_program_says_and_one_that_counts_nothing_has_failed() {
+        let workspace = Workspace::find().unwrap();
+        let program = std::env::current_exe().unwrap();
+        let log = std::env::temp_dir().join(format!("xtask-e2e-{}.log", std::process::id()));
+        let one = "e2e::tests::what_nobody_knows_is_started_first_and_then_the_longest".to_owned();
+        assert!(tests(&workspace, &program).unwrap().contains(&one));
+        let passed = ended(command(&workspace, &program).args([&one, "--exact"]), &log).unwrap();
+        assert_eq!(passed, (true, Count { passed: 1, failed: 0, ignored: 0 }));
+        let failed = |words: &str| ended(command(&workspace, Path::new("sh")).args(["-c", words]), &log).unwrap();
+        let one_failed = (false, Count { passed: 0, failed: 1, ignored: 0 });
+        assert_eq!([failed("exit 3"), failed("true")], [one_failed, one_failed]);
+        std::fs::remove_file(log).unwrap();
     }
 
     #[test]

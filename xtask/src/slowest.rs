@@ -79,6 +79,6 @@ mod tests {
         }
         let list = slowest.list();
         let list: Vec<_> = list.iter().map(|(took, name)| (took.as_secs(), name.as_str())).collect();
-        assert_eq!(list, [(17, "c"), (10, "a"), (3, "b"), (2, "e")]);
+        assert_eq!(list, [(17, "c"), (10, "a"), (3, "b"), (2, "e"), (1, "d")]);
     }
 }

@@ -4,6 +4,7 @@
 
 use crate::{code, dependencies, files, manifests, package, read, root, short, table};
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 
 /// Crates that no source names, and why they are needed all the same.
 const UNNAMED: &[(&str, &str, &str)] = &[("midshift-proto", "tonic-prost", "the code that its build script writes")];
@@ -20,11 +21,21 @@ fn names(source: &str, library: &str) -> bool {
     })
 }
 
-/// Sources below a folder of a package.
+/// Sources of other packages that this one takes in by their path.
+fn taken_in(path: &str, source: &str) -> String {
+    let paths = source.split("#[path = \"").skip(1).filter_map(|rest| rest.split('"').next());
+    let beside = Path::new(path).parent().unwrap_or(Path::new(""));
+    paths.filter(|path| path.starts_with("../")).map(|path| read(beside.join(path))).collect::<Vec<_>>().join("\n")
+}
+
+/// Sources below a folder of a package; those of tests with what they take in from elsewhere.
 fn sources(folder: &str, of_tests: bool) -> String {
     let in_tests =
         |path: &String| path.ends_with("/tests.rs") || path.contains("/tests/") || path.contains("/examples/");
-    let read = |path: String| if of_tests { read(&path) } else { code(&read(&path)) };
+    let read = |path: String| {
+        let source = read(&path);
+        if of_tests { taken_in(&path, &source) + &source } else { code(&source) }
+    };
     files(folder, "rs").into_iter().filter(|path| of_tests || !in_tests(path)).map(read).collect::<Vec<_>>().join("\n")
 }
 
