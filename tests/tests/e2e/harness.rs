@@ -142,7 +142,7 @@ const PORTS: &str = "MIDSHIFT_TEST_PORTS";
 fn ports() -> anyhow::Result<Range<u32>> {
     let told = std::env::var(PORTS).unwrap_or_else(|_| "12000..32000".to_owned());
     let (first, end) = told.split_once("..").with_context(|| format!("{PORTS} is {told:?}: say FIRST..END"))?;
-    let ports = first.parse().context(PORTS)?..end.parse().context(PORTS)?;
+    let ports = first.parse::<u32>().context(PORTS)?..end.parse::<u32>().context(PORTS)?;
     ensure!(!ports.is_empty(), "{PORTS} is {told:?}: there is none");
     Ok(ports)
 }
