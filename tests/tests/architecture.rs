@@ -9,6 +9,8 @@ mod circles;
 mod logs;
 #[path = "architecture/newer_words.rs"]
 mod newer_words;
+#[path = "architecture/dependencies.rs"]
+mod dependencies;
 #[path = "architecture/pages.rs"]
 mod pages;
 #[path = "architecture/serde_types.rs"]

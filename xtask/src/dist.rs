@@ -83,7 +83,7 @@ pub fn dist(workspace: &Workspace, options: &Options) -> Result<bool> {
     for line in std::fs::read_to_string(to.join("SHA256SUMS")).context("reading digests")?.lines() {
         run::print(line);
     }
-    run::print_line(&format!(
+    run::tell_person(&format!(
         "in {}; next: tag the commit v{version}, sign SHA256SUMS, publish the folder",
         to.display()
     ));

@@ -83,7 +83,7 @@ impl Daemon {
             let daemon = Self::start_with(folder, driver)?;
             match daemon {
                 Ok(daemon) => return Ok(daemon),
-                Err(said) => run::print_line(&format!("dockerd with {driver} does not start:\n{said}")),
+                Err(said) => run::tell_person(&format!("dockerd with {driver} does not start:\n{said}")),
             }
         }
         bail!(
@@ -194,7 +194,7 @@ pub fn test(workspace: &Workspace, midshift: &Path) -> Result<bool> {
 fn stacks(daemon: &Daemon, workspace: &Workspace, temporary: &Path, midshift: &Path) -> Result<bool> {
     let images = images::make(&|| daemon.docker(), temporary, &workspace.root, midshift)?;
     for stack in &STACKS {
-        run::print_line(stack.file);
+        run::tell_person(stack.file);
         if !works(stack, daemon, workspace, temporary, &images, midshift)? {
             return Ok(false);
         }
@@ -259,6 +259,6 @@ fn all_healthy(daemon: &Daemon, stack: &Stack) -> Result<bool> {
         up += usize::from(line.contains(" Up "));
         healthy += usize::from(line.ends_with("(healthy)"));
     }
-    run::print_line(&format!("{up} containers are up, {healthy} of them say that they are healthy"));
+    run::tell_person(&format!("{up} containers are up, {healthy} of them say that they are healthy"));
     Ok(up == stack.containers && healthy == stack.asked)
 }

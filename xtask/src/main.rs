@@ -5,13 +5,16 @@
 
 mod apt;
 mod clients;
+mod deny;
 mod dist;
 mod docker;
+mod e2e;
 mod engine;
 mod fetch_tools;
 mod go;
 mod images;
 mod parts;
+mod quick;
 mod run;
 mod slowest;
 mod stack;
@@ -33,18 +36,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Verb {
     /// Run the whole suite, or only the named parts, and print the minutes of each.
-    Test {
-        /// First install what the tests of real components need (grpcurl, buf, a Python with gRPC, the modules of the clients) into
-        /// target/tools, and strace, Go, Node.js and docker into the system.
-        #[arg(long)]
-        install: bool,
-        /// Leave out the part `compose`, which needs docker.
-        #[arg(long)]
-        no_docker: bool,
-        /// Parts to run, in the suite's order whatever the order here; none: all.
-        #[arg(value_enum)]
-        parts: Vec<parts::Part>,
-    },
+    Test(suite::Asked),
     /// Long fault sweeps, of which CI runs a sample: programs that are killed at work, simulated shifts, power cuts of updates, kills at each write of a latch,
     /// stops in simulated cuts and kills, stories, and nights.
     Torture {
@@ -78,7 +70,7 @@ enum Verb {
 
 fn main() -> ExitCode {
     let outcome = workspace::Workspace::find().and_then(|workspace| match Cli::parse().verb {
-        Verb::Test { install, no_docker, parts } => suite::test(&workspace, install, no_docker, &parts),
+        Verb::Test(asked) => suite::test(&workspace, &asked),
         Verb::Torture { nightly: true, from, .. } => {
             sweep::torture(&workspace, &sweep::NIGHTLY, from, Some(sweep::NIGHTLY_SEEDS))
         }
@@ -95,7 +87,7 @@ fn main() -> ExitCode {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::FAILURE,
         Err(error) => {
-            run::print_line(&format!("error: {error:#}"));
+            run::tell_person(&format!("error: {error:#}"));
             ExitCode::FAILURE
         }
     }

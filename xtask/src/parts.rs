@@ -7,13 +7,10 @@ use crate::fetch_tools::Tools;
 use crate::slowest::Slowest;
 use crate::stack::{self, Which};
 use crate::workspace::Workspace;
-use crate::{clients, dist, docker, engine, run};
+use crate::{clients, deny, dist, docker, e2e, engine, quick, run};
 use anyhow::Result;
 use clap::ValueEnum;
 use std::process::Command;
-
-/// Tests that are named after a part of tests.
-const SLOWEST_NAMED: usize = 10;
 
 /// One part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
@@ -32,10 +29,16 @@ pub enum Part {
     Clients,
     /// Tests inside the crates.
     Unit,
-    /// The integration suite.
+    /// The integration tests of the crates, and of the whole without its programs.
     Suite,
+    /// End-to-end tests: real programs, each test in a process of its own.
+    E2e,
     /// End-to-end tests that show something of PostgreSQL, again with it behind the store.
     Engine,
+    /// The daily loop, beside the tests inside the crates: model, architecture, and a handful of the simulation and of end-to-end tests.
+    Quick,
+    /// End-to-end tests on a machine whose cores are busy with something else.
+    Loaded,
     /// Examples in the documentation.
     Doc,
     /// Archives of a release: the same twice, whole, and what is in them starts.
@@ -44,6 +47,27 @@ pub enum Part {
     Stack,
     /// Both stacks by docker-compose on a docker of its own: each brought up, a task done through its public address, brought down.
     Compose,
+    /// Licences, advisories, bans and sources of all dependencies, by cargo-deny.
+    Deny,
+}
+
+/// How much is asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scope {
+    /// What is run before something lands.
+    Daily,
+    /// Everything, also what takes hours.
+    Nightly,
+}
+
+/// What parts are run with.
+pub struct Round<'w> {
+    /// The checkout.
+    pub workspace: &'w Workspace,
+    /// Tools of tests, if a part needs them.
+    pub tools: Option<Tools>,
+    /// How much is asked for.
+    pub scope: Scope,
 }
 
 /// What cargo's closing lines added up to.
@@ -69,29 +93,53 @@ impl Part {
             Self::Clients => "clients",
             Self::Unit => "unit",
             Self::Suite => "suite",
+            Self::E2e => "e2e",
             Self::Engine => "engine",
+            Self::Quick => "quick",
+            Self::Loaded => "loaded",
             Self::Doc => "doc",
             Self::Dist => "dist",
             Self::Stack => "stack",
             Self::Compose => "compose",
+            Self::Deny => "deny",
         }
+    }
+
+    /// Whether it belongs to a run for which no part is named.
+    pub fn is_in(self, scope: Scope) -> bool {
+        match self {
+            Self::Quick => false,
+            Self::Loaded | Self::Deny => scope == Scope::Nightly,
+            _ => true,
+        }
+    }
+
+    /// Whether it runs end-to-end tests.
+    pub fn runs_programs(self) -> bool {
+        matches!(self, Self::E2e | Self::Engine | Self::Loaded)
     }
 
     /// Whether outside tools take part.
     pub fn needs_tools(self) -> bool {
-        matches!(
+        let talks_to_them = matches!(
             self,
-            Self::Buf | Self::Clients | Self::Unit | Self::Suite | Self::Engine | Self::Stack | Self::Compose
-        )
+            Self::Buf | Self::Clients | Self::Unit | Self::Suite | Self::Quick | Self::Stack | Self::Compose
+        );
+        talks_to_them || self.runs_programs()
     }
 
     /// Whether it runs tests, which need the built programs.
     pub fn runs_tests(self) -> bool {
-        matches!(self, Self::Unit | Self::Suite | Self::Engine | Self::Doc | Self::Dist | Self::Stack | Self::Compose)
+        let has_tests = matches!(
+            self,
+            Self::Unit | Self::Suite | Self::Quick | Self::Doc | Self::Dist | Self::Stack | Self::Compose
+        );
+        has_tests || self.runs_programs()
     }
 
     /// Runs it; whether it succeeded. Tests are added to `count`.
-    pub fn run(self, workspace: &Workspace, tools: Option<&Tools>, count: &mut Count) -> Result<bool> {
+    pub fn run(self, round: &Round<'_>, count: &mut Count) -> Result<bool> {
+        let (workspace, tools) = (round.workspace, round.tools.as_ref());
         match self {
             Self::Fmt => run::succeeds(&mut workspace.cargo(&["fmt", "--all", "--check"])),
             Self::Clippy => {
@@ -111,16 +159,20 @@ impl Part {
                 let Some(tools) = tools else { return Ok(false) };
                 clients::build(workspace, &tools.python)
             }
-            Self::Unit => count.all(&mut tests(workspace, tools, &["--lib", "--bins"])?),
-            Self::Suite => count.all(&mut tests(workspace, tools, &["--test", "*"])?),
-            Self::Engine => {
-                let (name, value) = engine::VARIABLE;
-                count.all(tests(workspace, tools, &engine::selection())?.env(name, value))
+            Self::Unit => round.tests(&["--lib", "--bins"], count),
+            Self::Suite => {
+                let tests = workspace.tests.iter().filter(|name| *name != e2e::NAME);
+                round.tests(&tests.flat_map(|name| ["--test", name.as_str()]).collect::<Vec<_>>(), count)
             }
-            Self::Doc => count.all(&mut tests(workspace, tools, &["--doc"])?),
+            Self::E2e => e2e::play(round, &e2e::Way::default(), count),
+            Self::Engine => e2e::play(round, &engine::way(round.scope), count),
+            Self::Quick => quick::run(round, count),
+            Self::Loaded => e2e::play(round, &e2e::Way { is_loaded: true, ..e2e::Way::default() }, count),
+            Self::Doc => round.tests(&["--doc"], count),
             Self::Dist => count.one(dist::test(workspace)),
             Self::Stack => count.one(stack::test(workspace, &Which::split(), Some(workspace.midshift()))),
             Self::Compose => count.one(docker::test(workspace, &workspace.midshift())),
+            Self::Deny => count.one(deny::check(workspace)),
         }
     }
 }
@@ -130,41 +182,55 @@ pub fn build(workspace: &Workspace) -> Result<bool> {
     run::succeeds(&mut workspace.cargo(&["build", "--workspace", "--bins", "--examples", "--tests"]))
 }
 
-/// `cargo test` of these targets, which hear where the programs are.
-fn tests(workspace: &Workspace, tools: Option<&Tools>, targets: &[&str]) -> Result<Command> {
-    let mut command = workspace.cargo(&["test", "--workspace", "--no-fail-fast"]);
-    // What failed is said in a line; a hundred lines of where it was hide it.
-    command.args(targets).env("RUST_BACKTRACE", "0");
-    command.env("RUST_TEST_THREADS", threads().to_string());
-    workspace.export_programs(&mut command)?;
-    if let Some(tools) = tools {
-        tools.export(&mut command);
-        clients::export(workspace, &mut command);
-    }
-    Ok(command)
-}
-
 /// Tests that run at once. Most of them wait for programs that they started: two tests a core keep the cores busy.
-fn threads() -> usize {
+pub fn threads() -> usize {
     2 * std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
 }
 
-impl Count {
-    /// Runs test programs to the end, adds theirs up, and names the slowest tests; whether all succeeded.
-    #[expect(clippy::disallowed_methods, reason = "seconds of the tests by the wall, for a person")]
-    fn all(&mut self, tests: &mut Command) -> Result<bool> {
-        let begun = std::time::Instant::now();
-        let mut slowest = Slowest::new(threads());
-        let passed = run::reading(tests, |line| {
-            self.add(line);
-            slowest.add(line, begun.elapsed());
-        });
-        let list = slowest.list(SLOWEST_NAMED);
-        let lines: Vec<_> = list.iter().map(|(took, name)| format!("{:>6.1} s  {name}", took.as_secs_f64())).collect();
-        run::print_line(&format!("the slowest tests:\n{}", lines.join("\n")));
-        passed
+impl Round<'_> {
+    /// Tells tests where programs, tools and clients are.
+    pub fn surround(&self, command: &mut Command) -> Result<()> {
+        // What failed is said in a line; a hundred lines of where it was hide it.
+        command.env("RUST_BACKTRACE", "0");
+        self.workspace.export_programs(command)?;
+        if let Some(tools) = &self.tools {
+            tools.export(command);
+            clients::export(self.workspace, command);
+        }
+        Ok(())
     }
 
+    /// Runs the tests of these targets.
+    pub fn tests(&self, targets: &[&str], count: &mut Count) -> Result<bool> {
+        self.tests_with(targets, None, count)
+    }
+
+    /// The same with a variable in their environment. The slowest are named.
+    #[expect(clippy::disallowed_methods, reason = "seconds of the tests by the wall, for a person")]
+    pub fn tests_with(&self, targets: &[&str], variable: Option<(&str, &str)>, count: &mut Count) -> Result<bool> {
+        let mut command = self.workspace.cargo(&["test", "--workspace", "--no-fail-fast"]);
+        command.args(targets).env("RUST_TEST_THREADS", threads().to_string()).envs(variable);
+        self.surround(&mut command)?;
+        let begun = std::time::Instant::now();
+        let mut slowest = Slowest::new(threads());
+        let passed = run::reading(&mut command, |line| {
+            count.add(line);
+            slowest.add(line, begun.elapsed());
+        });
+        run::say_slowest(&slowest.list());
+        passed
+    }
+}
+
+impl std::ops::AddAssign for Count {
+    fn add_assign(&mut self, other: Self) {
+        self.passed += other.passed;
+        self.failed += other.failed;
+        self.ignored += other.ignored;
+    }
+}
+
+impl Count {
     /// A part that is one test.
     fn one(&mut self, passed: Result<bool>) -> Result<bool> {
         let good = matches!(passed, Ok(true));

@@ -48,10 +48,9 @@ impl Slowest {
         }
     }
 
-    /// The slowest, longest first.
-    pub fn list(mut self, most: usize) -> Vec<(Duration, String)> {
+    /// All of them, longest first.
+    pub fn list(mut self) -> Vec<(Duration, String)> {
         self.took.sort_by(|a, b| b.cmp(a));
-        self.took.truncate(most);
         self.took
     }
 }
@@ -78,8 +77,8 @@ mod tests {
         for (at, line) in lines {
             slowest.add(line, Duration::from_secs(at));
         }
-        let list = slowest.list(4);
+        let list = slowest.list();
         let list: Vec<_> = list.iter().map(|(took, name)| (took.as_secs(), name.as_str())).collect();
-        assert_eq!(list, [(17, "c"), (10, "a"), (3, "b"), (2, "e")]);
+        assert_eq!(list, [(17, "c"), (10, "a"), (3, "b"), (2, "e"), (1, "d")]);
     }
 }

@@ -51,12 +51,14 @@ pub enum Sweep {
     OldSites,
 }
 
-/// What runs every night, and with how many seeds.
+/// What runs every night by `torture --nightly`.
 pub const NIGHTLY: [Sweep; 3] = [Sweep::Stories, Sweep::Night, Sweep::OldSites];
+/// Whole stories and whole nights of every night.
 pub const NIGHTLY_SEEDS: u64 = 4;
 
 impl Sweep {
-    const ALL: [Self; 12] = [
+    /// All, in the order in which they are run.
+    pub const ALL: [Self; 12] = [
         Self::Kills,
         Self::Simulation,
         Self::Players,
@@ -93,25 +95,37 @@ impl Sweep {
         }
     }
 
-    fn run(self, workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
+    /// Its name on the command line.
+    pub fn name(self) -> String {
+        self.to_possible_value().map(|value| value.get_name().to_owned()).unwrap_or_default()
+    }
+
+    /// Runs it as every night; whether all laws held. Tests are added to `count`.
+    pub fn nightly(self, workspace: &Workspace, count: &mut Count) -> Result<bool> {
+        let seeds = if matches!(self, Self::Stories | Self::Night) { NIGHTLY_SEEDS } else { self.seeds() };
+        let mut runs = Runs { workspace, count: Count::default() };
+        let held = self.run(&mut runs, 1, seeds);
+        *count += runs.count;
+        held
+    }
+
+    fn run(self, runs: &mut Runs<'_>, from: u64, seeds: u64) -> Result<bool> {
         match self {
-            Self::Kills => each_seed(workspace, "kills", "kill::", from, seeds),
-            Self::Stories => each_seed(workspace, "stories", "story::", from, seeds),
-            Self::Night => each_seed(workspace, "night", "night::", from, seeds),
-            Self::Simulation => seeded(workspace, "simulation", "many_seeds_keep_every_law", from, seeds),
-            Self::Players => seeded(workspace, "simulation", "played::many_seeds", from, seeds),
-            Self::Sockets => over_sockets(workspace, from, seeds),
-            Self::Stops => seeded(workspace, "simulation", "stopped::in_cuts_and_kills", from, seeds),
-            Self::Skew => seeded(workspace, "simulation", "skew::", from, seeds),
-            Self::Split => split(workspace, seeds),
-            Self::OldSites => counted(test(workspace, "e2e", "old_site::").env("MIDSHIFT_OLD_TASKS", OLD_TASKS)),
+            Self::Kills => runs.each_seed("kills", "kill::", from, seeds),
+            Self::Stories => runs.each_seed("stories", "story::", from, seeds),
+            Self::Night => runs.each_seed("night", "night::", from, seeds),
+            Self::Simulation => runs.seeded("simulation", "many_seeds_keep_every_law", from, seeds),
+            Self::Players => runs.seeded("simulation", "played::many_seeds", from, seeds),
+            Self::Sockets => runs.over_sockets(from, seeds),
+            Self::Stops => runs.seeded("simulation", "stopped::in_cuts_and_kills", from, seeds),
+            Self::Skew => runs.seeded("simulation", "skew::", from, seeds),
+            Self::Split => runs.split(seeds),
+            Self::OldSites => runs.counted(runs.test("e2e", "old_site::").env("MIDSHIFT_OLD_TASKS", OLD_TASKS)),
             Self::Updates => {
-                let drawn = seeded(workspace, "agent", "drawn_cuts::", from, seeds)?;
-                Ok(drawn && every_site(workspace, "agent", "power::")?)
+                let drawn = runs.seeded("agent", "drawn_cuts::", from, seeds)?;
+                Ok(drawn && runs.every_site("agent", "power::")?)
             }
-            Self::Latch => {
-                Ok(every_site(workspace, "stop", "killed::")? && every_site(workspace, "agent", "stop_cuts::")?)
-            }
+            Self::Latch => Ok(runs.every_site("stop", "killed::")? && runs.every_site("agent", "stop_cuts::")?),
         }
     }
 }
@@ -120,9 +134,9 @@ impl Sweep {
 pub fn torture(workspace: &Workspace, sweeps: &[Sweep], from: Option<u64>, seeds: Option<u64>) -> Result<bool> {
     ensure!(seeds != Some(0), "--seeds must be at least 1");
     let from = first_seed(sweeps, from)?;
-    let mut held = true;
+    let (mut runs, mut held) = (Runs { workspace, count: Count::default() }, true);
     for sweep in Sweep::ALL.into_iter().filter(|s| sweeps.is_empty() || sweeps.contains(s)) {
-        held &= sweep.run(workspace, from, seeds.unwrap_or(sweep.seeds()))?;
+        held &= sweep.run(&mut runs, from, seeds.unwrap_or(sweep.seeds()))?;
     }
     Ok(held)
 }
@@ -134,58 +148,77 @@ fn first_seed(sweeps: &[Sweep], from: Option<u64>) -> Result<u64> {
     Ok(from.unwrap_or(1))
 }
 
-/// Tests that cut a process off at its calls: at every one.
-fn every_site(workspace: &Workspace, target: &str, filter: &str) -> Result<bool> {
-    counted(test(workspace, target, filter).env("MIDSHIFT_SITES", "all"))
+/// Calls of `cargo test`, and what their tests added up to.
+struct Runs<'w> {
+    workspace: &'w Workspace,
+    count: Count,
 }
 
-/// The workspace's one test program of this name.
-fn test(workspace: &Workspace, target: &str, filter: &str) -> Command {
-    workspace.cargo(&["test", "--workspace", "--test", target, "--", filter, "--nocapture"])
-}
-
-/// Real programs, seeds beside each other.
-fn over_sockets(workspace: &Workspace, from: u64, seeds: u64) -> Result<bool> {
-    ensure!(parts::build(workspace)?, "the programs do not build");
-    let mut command = test(workspace, "e2e", "played::");
-    workspace.export_programs(&mut command)?;
-    counted(command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string()))
-}
-
-/// Tests that play as many seeds as their environment says.
-fn seeded(workspace: &Workspace, target: &str, filter: &str, from: u64, seeds: u64) -> Result<bool> {
-    let mut command = test(workspace, target, filter);
-    counted(command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string()))
-}
-
-/// Real programs, once with each seed of `from .. from + seeds`. Ends at the first that breaks a law.
-fn each_seed(workspace: &Workspace, sweep: &str, filter: &str, from: u64, seeds: u64) -> Result<bool> {
-    ensure!(parts::build(workspace)?, "the programs do not build");
-    for seed in from..from.saturating_add(seeds) {
-        let mut command = test(workspace, "e2e", filter);
-        workspace.export_programs(&mut command)?;
-        command.env("MIDSHIFT_SEED", seed.to_string()).env("MIDSHIFT_STORY", "all").env("MIDSHIFT_NIGHT", "all");
-        if !counted(&mut command)? {
-            run::print_line(&format!("next: cargo xtask torture {sweep} --from {seed} --seeds 1"));
-            return Ok(false);
-        }
+impl Runs<'_> {
+    /// The workspace's one test program of this name.
+    fn test(&self, target: &str, filter: &str) -> Command {
+        self.workspace.cargo(&["test", "--workspace", "--test", target, "--", filter, "--nocapture"])
     }
-    Ok(true)
-}
 
-/// As often as `seeds` says: chance is the machine's.
-fn split(workspace: &Workspace, seeds: u64) -> Result<bool> {
-    ensure!(parts::build(workspace)?, "the programs do not build");
-    let tools = Tools::find(workspace)?;
-    for _ in 0..seeds {
-        let mut command = test(workspace, "e2e", "split::tasks_go_on");
-        workspace.export_programs(&mut command)?;
-        tools.export(&mut command);
-        if !counted(command.env("MIDSHIFT_SPLIT_ROBOTS", SPLIT_ROBOTS))? {
-            return Ok(false);
-        }
+    /// Tests that cut a process off at its calls: at every one.
+    fn every_site(&mut self, target: &str, filter: &str) -> Result<bool> {
+        self.counted(self.test(target, filter).env("MIDSHIFT_SITES", "all"))
     }
-    Ok(true)
+
+    /// Tests that play as many seeds as their environment says.
+    fn seeded(&mut self, target: &str, filter: &str, from: u64, seeds: u64) -> Result<bool> {
+        let mut command = self.test(target, filter);
+        self.counted(command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string()))
+    }
+
+    /// Tests of real programs, which are built.
+    fn programs(&self, filter: &str) -> Result<Command> {
+        ensure!(parts::build(self.workspace)?, "the programs do not build");
+        let mut command = self.test("e2e", filter);
+        self.workspace.export_programs(&mut command)?;
+        Ok(command)
+    }
+
+    /// Real programs, seeds beside each other.
+    fn over_sockets(&mut self, from: u64, seeds: u64) -> Result<bool> {
+        let mut command = self.programs("played::")?;
+        self.counted(command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string()))
+    }
+
+    /// Real programs, once with each seed of `from .. from + seeds`. Ends at the first that breaks a law.
+    fn each_seed(&mut self, sweep: &str, filter: &str, from: u64, seeds: u64) -> Result<bool> {
+        for seed in from..from.saturating_add(seeds) {
+            let mut command = self.programs(filter)?;
+            command.env("MIDSHIFT_SEED", seed.to_string()).env("MIDSHIFT_STORY", "all").env("MIDSHIFT_NIGHT", "all");
+            if !self.counted(&mut command)? {
+                run::tell_person(&format!("next: cargo xtask torture {sweep} --from {seed} --seeds 1"));
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// As often as `seeds` says: chance is the machine's.
+    fn split(&mut self, seeds: u64) -> Result<bool> {
+        let tools = Tools::find(self.workspace)?;
+        for _ in 0..seeds {
+            let mut command = self.programs("split::tasks_go_on")?;
+            tools.export(&mut command);
+            if !self.counted(command.env("MIDSHIFT_SPLIT_ROBOTS", SPLIT_ROBOTS))? {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    fn counted(&mut self, command: &mut Command) -> Result<bool> {
+        let mut count = Count::default();
+        let succeeded = run::reading(command, |line| count.add(line))?;
+        self.count += count;
+        run::print(&format!("{} passed, {} failed", count.passed, count.failed));
+        ensure!(!succeeded || count.passed > 0, "no test matched");
+        Ok(succeeded)
+    }
 }
 
 /// Runs the tests that hold golden files, in every test program whatever fails, and lets them write what they see.
@@ -193,22 +226,14 @@ pub fn golden(workspace: &Workspace) -> Result<bool> {
     ensure!(parts::build(workspace)?, "the programs do not build");
     let mut command = workspace.cargo(&["test", "--workspace", "--tests", "--no-fail-fast", "--", "golden"]);
     workspace.export_programs(&mut command)?;
-    let passed = counted(command.env("BLESS", "1"))?;
-    run::print_line("next: git diff, and read it before you commit it");
+    let passed = Runs { workspace, count: Count::default() }.counted(command.env("BLESS", "1"))?;
+    run::tell_person("next: git diff, and read it before you commit it");
     Ok(passed)
 }
 
 /// Formats, then [`golden`].
 pub fn tidy(workspace: &Workspace) -> Result<bool> {
     Ok(run::succeeds(&mut workspace.cargo(&["fmt", "--all"]))? && golden(workspace)?)
-}
-
-fn counted(command: &mut Command) -> Result<bool> {
-    let mut count = Count::default();
-    let succeeded = run::reading(command, |line| count.add(line))?;
-    run::print(&format!("{} passed, {} failed", count.passed, count.failed));
-    ensure!(!succeeded || count.passed > 0, "no test matched");
-    Ok(succeeded)
 }
 
 #[cfg(test)]

@@ -12,6 +12,7 @@ use midshift_proto::task::v1::{ListTasksRequest, Task, TaskFilter, TaskState};
 use std::collections::BTreeMap;
 use std::future::Future;
 use std::net::{SocketAddr, TcpListener};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -135,16 +136,27 @@ impl Drop for Running {
     }
 }
 
-/// A port nobody has: below those that the system gives to connections, so that none has it when a server is started there again, and no
-/// two of one test program.
+/// Which ports this program may have, of those below the ones that the system gives to connections, as `FIRST..END`; not set: all.
+const PORTS: &str = "MIDSHIFT_TEST_PORTS";
+
+fn ports() -> anyhow::Result<Range<u32>> {
+    let told = std::env::var(PORTS).unwrap_or_else(|_| "12000..32000".to_owned());
+    let (first, end) = told.split_once("..").with_context(|| format!("{PORTS} is {told:?}: say FIRST..END"))?;
+    let ports = first.parse::<u32>().context(PORTS)?..end.parse::<u32>().context(PORTS)?;
+    ensure!(!ports.is_empty(), "{PORTS} is {told:?}: there is none");
+    Ok(ports)
+}
+
+/// A port nobody has: none has it when a server is started there again, and no two of one test program. Programs that `cargo xtask test` runs
+/// beside each other have no port in common.
 pub fn free_port() -> anyhow::Result<SocketAddr> {
-    const PORTS: std::ops::Range<u32> = 12_000..32_000;
     static NEXT: AtomicU32 = AtomicU32::new(0);
+    let ports = ports()?;
     // Programs that run beside each other begin elsewhere.
     let first = std::process::id().wrapping_mul(997);
-    for _ in PORTS {
-        let nth = first.wrapping_add(NEXT.fetch_add(1, Ordering::Relaxed)) % (PORTS.end - PORTS.start);
-        let address = SocketAddr::from(([127, 0, 0, 1], u16::try_from(PORTS.start + nth)?));
+    for _ in ports.clone() {
+        let nth = first.wrapping_add(NEXT.fetch_add(1, Ordering::Relaxed)) % (ports.end - ports.start);
+        let address = SocketAddr::from(([127, 0, 0, 1], u16::try_from(ports.start + nth)?));
         if TcpListener::bind(address).is_ok() {
             return Ok(address);
         }

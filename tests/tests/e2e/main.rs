@@ -1,6 +1,6 @@
 //! Real programs as a user has them: the midshift binary, agents killed with SIGKILL, grpcurl, clients in three languages.
 //!
-//! `cargo xtask test` builds the programs once and says where they are.
+//! `cargo xtask test` builds the programs once, says where they are, and starts each test as a process of its own.
 
 /// Printed points make a failing run readable.
 macro_rules! say {

@@ -148,11 +148,11 @@ fn up(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Result<b
     let public = public.context("no service has a port for people")?;
     let state = State::begin(&folder, public.clone())?;
     let site = Site::below(&folder);
-    run::print_line(&format!("{} processes, logs in {}", processes.len(), folder.display()));
+    run::tell_person(&format!("{} processes, logs in {}", processes.len(), folder.display()));
     supervise::run(processes, state, || {
-        run::print_line(&format!("all are healthy; people and programs come in at {public}"));
+        run::tell_person(&format!("all are healthy; people and programs come in at {public}"));
         let (root, token) = (site.root.display(), site.token.display());
-        run::print_line(&format!("next: midshift login {public} --ca {root} --token-file {token}"));
+        run::tell_person(&format!("next: midshift login {public} --ca {root} --token-file {token}"));
     })
 }
 
@@ -189,11 +189,11 @@ fn detached(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Re
     loop {
         pause();
         if let Some(status) = child.try_wait().context("looking at the supervisor")? {
-            run::print_line(&std::fs::read_to_string(&log).unwrap_or_default());
+            run::tell_person(&std::fs::read_to_string(&log).unwrap_or_default());
             bail!("it ended: {status}; see {}", folder.display());
         }
         if State::find(&folder).is_some_and(|state| state.ready) {
-            run::print_line(std::fs::read_to_string(&log).unwrap_or_default().trim_end());
+            run::tell_person(std::fs::read_to_string(&log).unwrap_or_default().trim_end());
             return Ok(true);
         }
     }
@@ -245,7 +245,7 @@ pub fn test(workspace: &Workspace, which: &Which, binary: Option<PathBuf>) -> Re
         && State::find(&folder)
             .is_some_and(|s| submit_task(workspace, &binary, &s.public, &Site::below(&folder)).unwrap_or(false));
     if !done {
-        run::print_line(&format!("logs are in {state}"));
+        run::tell_person(&format!("logs are in {state}"));
         down(&folder, false)?;
         return Ok(false);
     }

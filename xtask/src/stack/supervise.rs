@@ -61,7 +61,7 @@ pub fn run(processes: Vec<Process>, mut state: State, ready: impl FnOnce()) -> R
             }
             if ready.is_some() && now.elapsed() > HEALTHY_WITHIN {
                 let late: Vec<_> = held.iter().filter(|h| !h.healthy).map(|h| h.process.name.as_str()).collect();
-                run::print_line(&format!("not healthy within {HEALTHY_WITHIN:?}: {}", late.join(", ")));
+                run::tell_person(&format!("not healthy within {HEALTHY_WITHIN:?}: {}", late.join(", ")));
                 break Ok(());
             }
         };
@@ -82,7 +82,7 @@ fn mend_stack(held: &mut [Held], state: &mut State) -> Result<()> {
                 (one.child, one.healthy) = (None, true);
                 continue;
             }
-            run::print_line(&format!("{} ended: {status}; it is started again", one.process.name));
+            run::tell_person(&format!("{} ended: {status}; it is started again", one.process.name));
             (one.child, one.healthy, one.next) = (None, false, Instant::now() + AGAIN);
         }
         // What has done its work is not done again.
@@ -158,7 +158,7 @@ async fn end(held: &mut [Held], looks: &mut tokio::time::Interval) {
                 let Some(child) = &mut one.child else { continue };
                 let ended = child.try_wait().is_ok_and(|status| status.is_some());
                 if !ended && Instant::now() > one.next {
-                    run::print_line(&format!("{} did not end by itself", one.process.name));
+                    run::tell_person(&format!("{} did not end by itself", one.process.name));
                     send_signal(child.id(), "KILL");
                     let _ = child.wait();
                     one.child = None;

@@ -1,0 +1,408 @@
+//! Runs end-to-end tests: each in a process of its own, the longest of the last run first, as many at once as there are permits.
+//!
+//! Invariants:
+//! 1. A test is started when it has its permits, in the order of the list: what it waits for them counts for none of its limits.
+//! 2. Split stacks, and what else starts many programs, take several permits, so that two of them at most run at once on two cores.
+//! 3. Tests that run at once have no port in common, also while a server of one is started again.
+//! 4. A test that does not end is ended with all that it started, and has failed.
+
+use crate::parts::{Count, Round, threads};
+use crate::run;
+use crate::workspace::Workspace;
+use anyhow::{Context, Result, bail, ensure};
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, VecDeque};
+use std::fs::File;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::sync_channel;
+use std::time::Duration;
+
+/// The test program.
+pub const NAME: &str = "e2e";
+/// Modules (`name::`) and single tests that take more than one permit of two a core. With three there is room for one small test beside.
+const HEAVY: &[(&str, usize)] = &[
+    ("followed::", 2),
+    ("handed_over::", 2),
+    ("identity::the_line_that_enrolls_a_robot_of_a_split_site_", 2),
+    ("kill::nothing_is_lost_and_nothing_done_twice_on_postgresql_", 2),
+    ("languages::each_client_and_foreign_ones_", 3),
+    ("languages::each_client_gives_up_in_time_and_outlives_a_split_stack_", 2),
+    ("night::", 2),
+    ("old_site::", 2),
+    ("partition::", 2),
+    ("played::", 2),
+    ("public_address::", 2),
+    ("split::", 3),
+    ("split_held::", 2),
+    ("split_restored::", 2),
+    ("story::", 2),
+    ("two_of_each::", 2),
+];
+/// Modules whose tests share what the first of them makes: one process has them all, with as many threads as permits.
+const TOGETHER: &[&str] = &["old_site::"];
+/// A test that takes longer hangs; the longest takes four minutes.
+const LIMIT: Duration = Duration::from_secs(1_200);
+/// Ports that tests may have: below those that the system gives to connections.
+const PORTS: Range<usize> = 12_000..32_000;
+/// What tells a test which of them are its own.
+const PORTS_VARIABLE: &str = "MIDSHIFT_TEST_PORTS";
+/// How often tests that run are looked at.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// One process: a test, or the tests of one module.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Unit {
+    name: String,
+    permits: usize,
+    /// What it took the last time.
+    expected: Option<Duration>,
+}
+
+/// What came of one.
+struct Played {
+    name: String,
+    permits: usize,
+    /// Which of those that ran at once it was.
+    slot: usize,
+    took: Duration,
+    outcome: Result<(bool, Count)>,
+}
+
+/// How a round of them is played.
+#[derive(Default)]
+pub struct Way<'w> {
+    /// Beginnings of the names of those that are played; none: all are.
+    pub only: Option<Vec<&'w str>>,
+    /// A variable of their environment.
+    pub variable: Option<(&'w str, &'w str)>,
+    /// Whether a thread a core computes beside them.
+    pub is_loaded: bool,
+}
+
+impl Unit {
+    /// Units of these tests, in the order in which they are started: those that nobody knows yet, then the longest, then those with most permits.
+    fn in_order(tests: &[String], times: &BTreeMap<String, Duration>, permits: usize) -> VecDeque<Self> {
+        let mut names: Vec<&str> = Vec::new();
+        for test in tests {
+            let name = TOGETHER.iter().copied().find(|module| test.starts_with(module)).unwrap_or(test);
+            if !names.contains(&name) {
+                names.push(name);
+            }
+        }
+        let unit = |name: &str| {
+            let heavy = HEAVY.iter().find(|(heavy, _)| name.starts_with(heavy)).map_or(1, |(_, permits)| *permits);
+            Self { name: name.to_owned(), permits: heavy.min(permits), expected: times.get(name).copied() }
+        };
+        let mut units: Vec<Self> = names.into_iter().map(unit).collect();
+        units.sort_by_key(|unit| {
+            (unit.expected.is_some(), Reverse(unit.expected), Reverse(unit.permits), unit.name.clone())
+        });
+        units.into()
+    }
+}
+
+/// The first in the queue, if so many permits are enough for it: nobody overtakes.
+fn granted(queue: &mut VecDeque<Unit>, free: usize) -> Option<Unit> {
+    queue.front().is_some_and(|unit| unit.permits <= free).then(|| queue.pop_front()).flatten()
+}
+
+/// Plays them; whether all passed. Tests are added to `count`.
+pub fn play(round: &Round<'_>, way: &Way<'_>, count: &mut Count) -> Result<bool> {
+    let program = program(round.workspace)?;
+    let times = Times::read(round.workspace);
+    let tests: Vec<String> = tests(round.workspace, &program)?.into_iter().filter(|name| way.plays(name)).collect();
+    ensure!(!tests.is_empty(), "no end-to-end test has such a name");
+    let folder = round.workspace.target.join("e2e");
+    std::fs::create_dir_all(&folder).with_context(|| format!("creating {}", folder.display()))?;
+    let queue = Unit::in_order(&tests, &times.0, threads());
+    let stop = AtomicBool::new(false);
+    let played = std::thread::scope(|scope| {
+        for _ in 0..if way.is_loaded { threads() / 2 } else { 0 } {
+            scope.spawn(|| {
+                while !stop.load(Ordering::Relaxed) {
+                    std::hint::spin_loop();
+                }
+            });
+        }
+        let played =
+            all(queue, threads(), |unit, slot| round.one(unit, way, &program, &folder, ports(slot, threads())));
+        stop.store(true, Ordering::Relaxed);
+        played
+    });
+    if way.variable.is_none() && !way.is_loaded {
+        times.with(&played).write(round.workspace)?;
+    }
+    summary(&played, count)
+}
+
+/// The share of the ports that one of so many slots has.
+fn ports(slot: usize, slots: usize) -> Range<usize> {
+    let share = PORTS.len() / slots;
+    let first = PORTS.start + slot * share;
+    first..first + share
+}
+
+/// Starts each when it has its permits, in a slot that no other has meanwhile, and waits for all.
+fn all(
+    mut queue: VecDeque<Unit>,
+    permits: usize,
+    one: impl Fn(&Unit, usize) -> Result<(bool, Count)> + Sync,
+) -> Vec<Played> {
+    let (mut free, mut slots, mut played) = (permits, (0..permits).collect::<Vec<_>>(), Vec::new());
+    let (ended, ends) = sync_channel::<Played>(permits);
+    std::thread::scope(|scope| {
+        loop {
+            while let Some(unit) = granted(&mut queue, free) {
+                free -= unit.permits;
+                // Each takes a permit at least.
+                let slot = slots.pop().unwrap_or_default();
+                let (ended, one) = (ended.clone(), &one);
+                scope.spawn(move || {
+                    let (outcome, took) = run::timed(|| one(&unit, slot));
+                    // Nobody listens any more where the other side has panicked.
+                    let _ = ended.send(Played { name: unit.name, permits: unit.permits, slot, took, outcome });
+                });
+            }
+            if free == permits {
+                return;
+            }
+            let Ok(one) = ends.recv() else { return };
+            free += one.permits;
+            slots.push(one.slot);
+            let word = if one.passed() { "ok" } else { "FAILED" };
+            run::print(&format!("test {} ... {word} {:.1} s", one.name, one.took.as_secs_f64()));
+            played.push(one);
+        }
+    });
+    played
+}
+
+/// Adds them up and names the slowest; whether all passed.
+fn summary(played: &[Played], count: &mut Count) -> Result<bool> {
+    let mut slowest: Vec<_> = played.iter().map(|one| (one.took, one.name.clone())).collect();
+    slowest.sort_by(|a, b| b.cmp(a));
+    run::say_slowest(&slowest);
+    for one in played {
+        match &one.outcome {
+            Ok((_, own)) => *count += *own,
+            Err(error) => {
+                run::tell_person(&format!("{}: {error:#}", one.name));
+                count.failed += 1;
+            }
+        }
+    }
+    Ok(played.iter().all(Played::passed))
+}
+
+impl Played {
+    fn passed(&self) -> bool {
+        matches!(self.outcome, Ok((true, _)))
+    }
+}
+
+impl Way<'_> {
+    fn plays(&self, name: &str) -> bool {
+        self.only.as_ref().is_none_or(|only| only.iter().any(|begin| name.starts_with(begin)))
+    }
+}
+
+impl Round<'_> {
+    /// Runs one to its end; whether it passed. What it says is shown if it failed.
+    fn one(
+        &self,
+        unit: &Unit,
+        way: &Way<'_>,
+        program: &Path,
+        folder: &Path,
+        ports: Range<usize>,
+    ) -> Result<(bool, Count)> {
+        let mut command = command(self.workspace, program);
+        command.arg(&unit.name);
+        if TOGETHER.contains(&unit.name.as_str()) {
+            command.env("RUST_TEST_THREADS", unit.permits.to_string());
+        } else {
+            command.arg("--exact");
+        }
+        command.envs(way.variable).env(PORTS_VARIABLE, format!("{}..{}", ports.start, ports.end));
+        self.surround(&mut command)?;
+        let log = format!("{}.log", unit.name.trim_end_matches(':').replace("::", "."));
+        ended(&mut command, &folder.join(log))
+    }
+}
+
+/// Runs a test program to its end; whether its tests passed, and which. What it says goes to `log`, and is shown if they did not.
+fn ended(command: &mut Command, log: &Path) -> Result<(bool, Count)> {
+    let file = File::create(log).with_context(|| format!("creating {}", log.display()))?;
+    let begun = command.stdout(file.try_clone().context("its output")?).stderr(file).spawn();
+    let succeeded = run::within(begun.context("starting a test")?, LIMIT, LOOK)?;
+    let said = String::from_utf8_lossy(&std::fs::read(log).context("reading what it said")?).into_owned();
+    let mut count = Count::default();
+    said.lines().for_each(|line| count.add(line));
+    let passed = succeeded && count.failed == 0 && count != Count::default();
+    if !passed {
+        run::print(&format!("---- {}\n{said}", log.display()));
+        // A program that was ended has counted nothing.
+        count.failed = count.failed.max(1);
+    }
+    Ok((passed, count))
+}
+
+/// The test program, where `cargo test` would run it.
+fn command(workspace: &Workspace, program: &Path) -> Command {
+    let mut command = workspace.command(program);
+    command.current_dir(workspace.root.join("tests"));
+    command
+}
+
+/// Builds the test program; where it is.
+fn program(workspace: &Workspace) -> Result<PathBuf> {
+    let how = ["test", "--workspace", "--test", NAME, "--no-run", "--message-format", "json-render-diagnostics"];
+    let output = workspace.cargo(&how).stderr(std::process::Stdio::inherit()).output().context("running cargo")?;
+    ensure!(output.status.success(), "the end-to-end tests do not build");
+    let lines = String::from_utf8_lossy(&output.stdout).into_owned();
+    let built = lines.lines().filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
+    let mut built =
+        built.filter(|one| one["target"]["name"] == NAME).filter_map(|one| Some(one["executable"].as_str()?.into()));
+    built.next().context("cargo names no program of the end-to-end tests")
+}
+
+/// Names of its tests.
+fn tests(workspace: &Workspace, program: &Path) -> Result<Vec<String>> {
+    let output = command(workspace, program).args(["--list", "--format", "terse"]).output().context("listing tests")?;
+    if !output.status.success() {
+        bail!("listing tests: {}", String::from_utf8_lossy(&output.stderr).trim());
+    }
+    let lines = String::from_utf8_lossy(&output.stdout).into_owned();
+    Ok(lines.lines().filter_map(|line| line.strip_suffix(": test")).map(str::to_owned).collect())
+}
+
+/// What each took the last time, by name: lines of milliseconds and a name, kept in the target directory.
+#[derive(Default)]
+struct Times(BTreeMap<String, Duration>);
+
+impl Times {
+    fn path(workspace: &Workspace) -> PathBuf {
+        workspace.target.join("e2e-times")
+    }
+
+    /// None where there is no file: then everything is new.
+    fn read(workspace: &Workspace) -> Self {
+        let text = std::fs::read_to_string(Self::path(workspace)).unwrap_or_default();
+        Self(text.lines().filter_map(|line| line.split_once(' ')).filter_map(Self::line).collect())
+    }
+
+    fn line((millis, name): (&str, &str)) -> Option<(String, Duration)> {
+        Some((name.to_owned(), Duration::from_millis(millis.parse().ok()?)))
+    }
+
+    fn with(mut self, played: &[Played]) -> Self {
+        self.0.extend(played.iter().map(|one| (one.name.clone(), one.took)));
+        self
+    }
+
+    fn write(&self, workspace: &Workspace) -> Result<()> {
+        let text: String = self.0.iter().map(|(name, took)| format!("{} {name}\n", took.as_millis())).collect();
+        std::fs::write(Self::path(workspace), text).context("noting what each test took")
+    }
+}
+
+/// Names of all tests as they stand in the sources, `module::name`, with the source of their modules.
+#[cfg(test)]
+pub fn in_sources() -> Vec<(String, String)> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/tests/e2e");
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(folder).expect("the suite").flatten() {
+        let text = std::fs::read_to_string(entry.path()).expect("a file");
+        let module = entry.path().file_stem().expect("a name").to_string_lossy().into_owned();
+        for marked in text.split("#[test]").flat_map(|part| part.split("#[tokio::test")).skip(1) {
+            let name = marked.split("fn ").nth(1).and_then(|rest| rest.split('(').next()).expect("a test has a name");
+            names.push((format!("{module}::{name}"), marked.to_owned()));
+        }
+    }
+    names
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::Mutex;
+
+    fn queue(tests: &[&str], times: &[(&str, u64)], permits: usize) -> VecDeque<Unit> {
+        let tests: Vec<String> = tests.iter().map(|test| (*test).to_owned()).collect();
+        let times = times.iter().map(|(name, s)| ((*name).to_owned(), Duration::from_secs(*s))).collect();
+        Unit::in_order(&tests, &times, permits)
+    }
+
+    #[test]
+    fn what_nobody_knows_is_started_first_and_then_the_longest() {
+        let order = |tests: &[&str], times: &[(&str, u64)]| -> Vec<_> {
+            queue(tests, times, 4).into_iter().map(|unit| (unit.name, unit.permits)).collect()
+        };
+        let known = order(&["a::a", "b::b", "split::c", "new::d"], &[("a::a", 5), ("b::b", 90), ("split::c", 30)]);
+        assert_eq!(
+            known.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>(),
+            ["new::d", "b::b", "split::c", "a::a"]
+        );
+        let first = order(&["a::a", "partition::b", "old_site::c", "old_site::d", "split::e"], &[]);
+        let first: Vec<_> = first.iter().map(|(name, permits)| (name.as_str(), *permits)).collect();
+        assert_eq!(first, [("split::e", 3), ("old_site::", 2), ("partition::b", 2), ("a::a", 1)]);
+    }
+
+    #[test]
+    fn never_more_run_at_once_than_have_permits_and_nobody_overtakes() {
+        let tests =
+            ["partition::a", "split::a", "split_held::a", "split_restored::a", "two_of_each::a", "x::a", "y::a"];
+        // Permits and slots of those that run at each moment at which one is started.
+        let (running, moments) = (Mutex::new(BTreeMap::new()), Mutex::new(Vec::new()));
+        let played = all(queue(&tests, &[], 4), 4, |unit, slot| {
+            let mut now = running.lock().unwrap();
+            let other: Option<usize> = now.insert(slot, unit.permits);
+            moments.lock().unwrap().push((other, now.values().copied().collect::<Vec<usize>>()));
+            drop(now);
+            std::thread::yield_now();
+            running.lock().unwrap().remove(&slot);
+            Ok((true, Count::default()))
+        });
+        let moments = moments.into_inner().unwrap();
+        assert_eq!((played.len(), moments.len()), (7, 7));
+        for (other, permits) in &moments {
+            let heavy = permits.iter().filter(|permits| **permits > 1).count();
+            assert!(other.is_none() && permits.iter().sum::<usize>() <= 4 && heavy <= 2, "{moments:?}");
+        }
+        let shares: Vec<_> = (0..3).map(|slot| ports(slot, 3)).collect();
+        assert_eq!(shares, [12_000..18_666, 18_666..25_332, 25_332..31_998], "none has a port of another");
+        let one_core = queue(&["split::a"], &[], 2);
+        assert_eq!(one_core[0].permits, 2, "it takes what there is");
+    }
+
+    #[test]
+    fn what_passed_is_read_off_what_a_program_says_and_one_that_counts_nothing_has_failed() {
+        let workspace = Workspace::find().unwrap();
+        let program = std::env::current_exe().unwrap();
+        let log = std::env::temp_dir().join(format!("xtask-e2e-{}.log", std::process::id()));
+        let one = "e2e::tests::what_nobody_knows_is_started_first_and_then_the_longest".to_owned();
+        assert!(tests(&workspace, &program).unwrap().contains(&one));
+        let passed = ended(command(&workspace, &program).args([&one, "--exact"]), &log).unwrap();
+        assert_eq!(passed, (true, Count { passed: 1, failed: 0, ignored: 0 }));
+        let failed = |words: &str| ended(command(&workspace, Path::new("sh")).args(["-c", words]), &log).unwrap();
+        let one_failed = (false, Count { passed: 0, failed: 1, ignored: 0 });
+        assert_eq!([failed("exit 3"), failed("true")], [one_failed, one_failed]);
+        std::fs::remove_file(log).unwrap();
+    }
+
+    #[test]
+    fn whatever_is_heavy_or_together_is_there_and_each_split_stack_is_heavy() {
+        let names = in_sources();
+        for name in HEAVY.iter().map(|(name, _)| name).chain(TOGETHER) {
+            assert!(names.iter().any(|(test, _)| test.starts_with(name)), "no test is called {name}* any more");
+        }
+        for (test, text) in names {
+            let is_split =
+                ["Stack::start(", "with_software(", "Factory::split("].iter().any(|word| text.contains(word));
+            assert!(!is_split || HEAVY.iter().any(|(heavy, _)| test.starts_with(heavy)), "{test} starts a split stack");
+        }
+    }
+}

@@ -1,0 +1,40 @@
+//! The daily loop: what shows most of a change in five minutes, beside the tests inside the crates.
+//!
+//! Invariant: it proves nothing that the suite does not prove again.
+
+use crate::e2e::{self, Way};
+use crate::parts::{Count, Round};
+use anyhow::Result;
+
+/// Shifts that are simulated: some five seconds a core.
+const SEEDS: (&str, &str) = ("MIDSHIFT_SEEDS", "24");
+/// End-to-end tests, one for each thing that a change is likely to break.
+const HANDFUL: [&str; 5] = [
+    "begin_and_end::dev_prints_its_ports_",
+    "rolled_out::",
+    "stopped::a_stopped_fleet_",
+    "kill::nothing_is_lost_and_nothing_done_twice_when_server_and_agents_",
+    "watched::",
+];
+
+/// Runs it; whether all passed. Nothing is left out after a test that failed.
+pub fn run(round: &Round<'_>, count: &mut Count) -> Result<bool> {
+    let pages = round.tests(&["--test", "architecture", "--test", "model"], count)?;
+    let simulation = ["--test", "simulation", "--", "many_seeds_keep_every_law"];
+    let shifts = round.tests_with(&simulation, Some(SEEDS), count)?;
+    let programs = e2e::play(round, &Way { only: Some(HANDFUL.to_vec()), ..Way::default() }, count)?;
+    Ok(pages && shifts && programs)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::HANDFUL;
+
+    #[test]
+    fn each_of_the_handful_is_there() {
+        let names = crate::e2e::in_sources();
+        for begin in HANDFUL {
+            assert!(names.iter().any(|(name, _)| name.starts_with(begin)), "no test is called {begin}* any more");
+        }
+    }
+}
