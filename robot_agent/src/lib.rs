@@ -7,7 +7,6 @@ pub mod body;
 pub mod boot;
 pub mod bugs;
 pub mod bulk;
-pub mod clock;
 pub mod core;
 pub mod device;
 pub mod dial;
@@ -41,4 +40,5 @@ pub mod trust;
 pub mod update;
 pub mod work;
 
+pub use midshift_os::clock;
 pub use program::{Config, run};

@@ -25,7 +25,7 @@ pub async fn look(resolved: &Resolved, address: &str, now: Utc, online: &[String
         return vec![Finding::look(
             "stop",
             format!(
-                "no stop service of this site answers at {address}: `midshift stop` reaches nobody; `midshift stop serve`, or --stop-server if it is elsewhere"
+                "no stop service of this site answers at {address}: `midshift stop` reaches nobody; `midshift-stop`, or --stop-server if it is elsewhere"
             ),
         )];
     }

@@ -6,18 +6,18 @@
 pub mod background;
 pub mod backup;
 mod changed_map;
-pub mod clock;
 pub mod clock_doubt;
 mod clock_jump;
 pub mod commands;
 mod denials;
 pub mod dev;
-pub mod door;
-pub mod logs;
 pub mod machines;
+#[cfg(test)]
+mod old_connections {
+    mod tests;
+}
 mod parts;
 pub mod planning;
-pub mod recorder;
 pub mod report;
 mod resuming;
 pub mod robots;
@@ -32,6 +32,8 @@ pub mod tally;
 pub mod throwaway;
 pub mod under_way;
 mod upkeep;
+
+pub use midshift_process::{clock, door, logs, recorder};
 
 #[cfg(test)]
 #[path = "../../../tests/src/postgres.rs"]

@@ -15,8 +15,8 @@ const SHARED_FROM: usize = 10;
 const HEAD: &str = "\
 # The command line
 
-Every command of `midshift` with its arguments and exit codes. This page is written from the program itself by
-`cargo xtask golden`; do not edit it.
+Every command of `midshift`, and `midshift-stop`, with arguments and exit codes. This page is written from the programs
+themselves by `cargo xtask golden`; do not edit it.
 
 Results go to stdout and everything else to stderr. `-o json` is the stable contract.
 ";
@@ -143,8 +143,9 @@ fn count(command: &Command, counted: &mut BTreeMap<String, usize>) {
     verbs(command).into_iter().for_each(|verb| count(verb, counted));
 }
 
-fn tell(command: &Command, path: &str, depth: usize, shared: &BTreeMap<String, usize>, page: &mut String) {
-    let _infallible = write!(page, "\n{} midshift {path}\n", "#".repeat(depth));
+/// `line` is what people type, from the name of the program on.
+fn tell(command: &Command, line: &str, depth: usize, shared: &BTreeMap<String, usize>, page: &mut String) {
+    let _infallible = write!(page, "\n{} {line}\n", "#".repeat(depth));
     let about = command.get_long_about().or_else(|| command.get_about()).map(ToString::to_string).unwrap_or_default();
     for paragraph in about.split("\n\n") {
         *page += "\n";
@@ -171,7 +172,7 @@ fn tell(command: &Command, path: &str, depth: usize, shared: &BTreeMap<String, u
     }
     let ends: Vec<String> = EXIT_CODES
         .iter()
-        .filter(|(.., commands)| commands.contains(&path))
+        .filter(|(.., commands)| line.strip_prefix("midshift ").is_some_and(|path| commands.contains(&path)))
         .map(|(code, meaning, _)| format!("{code} ({meaning})"))
         .collect();
     if !ends.is_empty() {
@@ -179,7 +180,7 @@ fn tell(command: &Command, path: &str, depth: usize, shared: &BTreeMap<String, u
         *page += &wrapped(&format!("Its own exit codes: {}.", ends.join("; ")), "");
     }
     for verb in verbs(command) {
-        tell(verb, &format!("{path} {}", verb.get_name()), depth + 1, shared, page);
+        tell(verb, &format!("{line} {}", verb.get_name()), depth + 1, shared, page);
     }
 }
 
@@ -199,8 +200,11 @@ fn page() -> String {
     page += "\n## Options of many commands\n\n";
     shared.keys().for_each(|item| page += item);
     for command in verbs(&whole) {
-        tell(command, command.get_name(), 2, &shared, &mut page);
+        tell(command, &format!("midshift {}", command.get_name()), 2, &shared, &mut page);
     }
+    let mut stop = midshift_stop::program::Args::command();
+    stop.build();
+    tell(&stop, "midshift-stop", 2, &shared, &mut page);
     page
 }
 
@@ -244,7 +248,7 @@ fn every_line_of_the_page_is_one_that_people_can_read() {
         page.lines().filter(|line| !line.starts_with('|') && line.chars().count() > LINE_MAX).collect();
     assert_eq!(long, Vec::<&str>::new());
     for command in
-        ["## midshift dev", "### midshift task submit", "### midshift rollout wait", "#### midshift bundle root rotate"]
+        ["## midshift dev", "### midshift task submit", "#### midshift bundle root rotate", "## midshift-stop"]
     {
         assert!(page.lines().any(|line| line == command), "{command}");
     }
