@@ -10,15 +10,19 @@
 pub mod record;
 
 use std::ffi::OsString;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, DirBuilder, File, OpenOptions, Permissions};
 use std::io::{self, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 /// Mode of a file that holds no secret: the process's mask decides.
 pub const OPEN: u32 = 0o666;
 /// Mode of a file with a secret: its owner reads and writes, nobody else.
 pub const PRIVATE: u32 = 0o600;
+/// What nobody but the owner may have of a folder with secrets.
+const OTHERS: u32 = 0o077;
+/// What images and repositories put into a folder that is there for something else.
+const PLACEHOLDER: &str = "README";
 
 /// Puts a small file in place of another, whole or not at all: a new file beside it, synced, renamed, and its folder
 /// synced.
@@ -105,6 +109,17 @@ pub fn sync_folder(folder: &Path) -> io::Result<()> {
     File::open(folder)?.sync_all()
 }
 
+/// The text of a file of at most so many bytes.
+///
+/// # Errors
+/// It cannot be read, is larger, or is no text.
+pub fn read_text(path: &Path, bytes_max: u64) -> io::Result<String> {
+    if fs::metadata(path)?.len() > bytes_max {
+        return Err(io::Error::new(io::ErrorKind::FileTooLarge, format!("it is larger than {bytes_max} bytes")));
+    }
+    fs::read_to_string(path)
+}
+
 /// Makes a folder that is not there, and those above it. Of two who make it at once both succeed.
 ///
 /// # Errors
@@ -121,6 +136,31 @@ pub fn make_folder(folder: &Path) -> io::Result<()> {
         Err(error) if error.kind() != io::ErrorKind::AlreadyExists || !folder.is_dir() => Err(error),
         _ => sync_folder(above),
     }
+}
+
+/// Makes the folder for its owner alone. One that is there and open to others is closed if there is nothing in it yet,
+/// as a new volume is, and refused if there is: somebody may have read it.
+///
+/// # Errors
+/// It cannot be made or looked at, or others may look into it: then the error says what to type.
+pub fn make_private_folder(folder: &Path) -> io::Result<()> {
+    DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
+    let mode = folder.metadata()?.permissions().mode();
+    if mode & OTHERS == 0 {
+        return Ok(());
+    }
+    for entry in folder.read_dir()? {
+        if entry?.file_name() != PLACEHOLDER {
+            let (mode, path) = (mode & 0o777, folder.display());
+            return Err(io::Error::new(
+                io::ErrorKind::PermissionDenied,
+                format!(
+                    "it has keys or other secrets and is open to others (mode {mode:03o}): type `chmod go= {path}`, after asking who may have read it"
+                ),
+            ));
+        }
+    }
+    fs::set_permissions(folder, Permissions::from_mode(0o700))
 }
 
 fn folder_of(path: &Path) -> &Path {
@@ -168,6 +208,26 @@ mod tests {
 
     fn count(folder: &Path) -> usize {
         fs::read_dir(folder).expect("is there").count()
+    }
+
+    #[test]
+    fn a_folder_is_its_owners_alone_and_one_that_others_may_have_read_is_refused_with_what_to_type() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let at = |name: &str| dir.path().join(name);
+        let mode = |name: &str| at(name).metadata().expect("a folder").permissions().mode() & 0o777;
+        make_private_folder(&at("made/below")).expect("made");
+        assert_eq!(mode("made/below"), 0o700);
+        for name in ["volume", "used"] {
+            DirBuilder::new().mode(0o755).create(at(name)).expect("a folder");
+            fs::set_permissions(at(name), Permissions::from_mode(0o755)).expect("open");
+        }
+        fs::write(at("volume/README"), "of the image").expect("written");
+        make_private_folder(&at("volume")).expect("nothing of ours was in it yet");
+        assert_eq!(mode("volume"), 0o700);
+        fs::write(at("used/control.db"), "rows").expect("written");
+        let refused = make_private_folder(&at("used")).expect_err("others may look into it").to_string();
+        assert!(refused.contains("(mode 755)") && refused.contains(&format!("chmod go= {}", at("used").display())));
+        assert_eq!(mode("used"), 0o755, "that is for a person to decide");
     }
 
     #[test]

@@ -9,7 +9,6 @@
 
 pub mod body;
 pub mod bugs;
-pub mod clock;
 pub mod core;
 pub mod launcher;
 pub mod program;
@@ -21,6 +20,7 @@ pub mod transport;
 pub mod update;
 
 pub use launcher::{boot, start_policy, switch};
+pub use midshift_os::clock;
 pub use program::{Config, environment, launcher_heartbeat, run};
 pub use storage::{device, ledger, memory, ring, sqlite, store};
 pub use transport::{bulk, dial, enrolment, replay, tls};

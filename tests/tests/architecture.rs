@@ -47,8 +47,8 @@ const SPAWNS: &[(&str, &str)] = &[
         "services/midshift/src/enrol_simulated.rs",
         "the binary enrols many machines side by side and renews what they got",
     ),
-    ("services/midshift/src/stop/manager.rs", "a service manager that hangs must not hold up the stop service"),
-    ("services/midshift/src/stop.rs", "who is known is followed as long as the port of the stop service is open"),
+    ("services/stop/src/program/manager.rs", "a service manager that hangs must not hold up the stop service"),
+    ("services/stop/src/program/principals.rs", "who is known is followed as long as the port is open"),
     ("services/midshift/src/robots.rs", "the binary lets a person walk beside its robot"),
     ("services/store/src/sqlite/mod.rs", "the one writer of a file and its checkpoints"),
     ("services/store/src/sqlite/frames.rs", "the one writer of a file and its checkpoints"),
@@ -278,9 +278,26 @@ fn only_the_store_and_the_agent_know_sql_and_core_knows_no_runtime_and_no_wire()
                 assert!(!imports.contains(banned), "core imports {banned}");
             }
         }
-        if !["midshift", "midshift-cli", "midshift-bench", "midshift-tests", "xtask"].contains(&name.as_str()) {
+        let programs = [
+            "midshift",
+            "midshift-cli",
+            "midshift-process",
+            "midshift-stop",
+            "midshift-bench",
+            "midshift-tests",
+            "xtask",
+        ];
+        if !programs.contains(&name.as_str()) {
             assert!(!imports.contains("anyhow"), "{name} imports anyhow");
         }
+    }
+}
+
+#[test]
+fn the_service_of_stops_knows_its_errors_and_only_its_program_has_anyhow() {
+    let programs = ["services/stop/src/port.rs", "services/stop/src/program/"];
+    for path in files("services/stop/src", "rs").iter().filter(|path| !programs.iter().any(|p| path.starts_with(p))) {
+        assert!(!code(&read(path)).contains("anyhow"), "{path}");
     }
 }
 
@@ -429,7 +446,7 @@ fn files_are_made_durable_by_one_crate() {
 
 #[test]
 fn there_is_no_unbounded_queue() {
-    for room in ["cli/src", "core/src", "proto/src", "services", "robot_agent/src", "robot_sim/src"] {
+    for room in ["cli/src", "core/src", "os/src", "proto/src", "services", "robot_agent/src", "robot_sim/src"] {
         for path in files(room, "rs").into_iter().filter(|p| p.contains("src/")) {
             let text = code(&read(&path));
             for word in [
@@ -447,9 +464,8 @@ fn there_is_no_unbounded_queue() {
 
 #[test]
 fn wall_and_monotonic_clocks_are_read_by_the_binaries_alone() {
-    // The launcher is a program of its own, kept beside the switch record that it reads. Programs of makers have the agent's clock.
-    let binaries =
-        ["services/midshift/", "robot_agent/src/bin/", "robot_agent/src/launcher/mod.rs", "robot_agent/src/clock.rs"];
+    // The launcher is a program of its own, kept beside the switch record that it reads. Others have the clock of `os`.
+    let binaries = ["services/midshift/", "robot_agent/src/bin/", "robot_agent/src/launcher/mod.rs"];
     for room in ["cli/src", "services", "robot_agent/src", "robot_sim/src"] {
         for path in
             files(room, "rs").into_iter().filter(|p| p.contains("src/") && !binaries.iter().any(|b| p.starts_with(b)))

@@ -13,7 +13,9 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Programs of an archive.
-const PROGRAMS: [&str; 2] = ["midshift", "midshift-launcher"];
+const PROGRAMS: [&str; 3] = ["midshift", "midshift-stop", "midshift-launcher"];
+/// Packages that they are of.
+const PACKAGES: [&str; 3] = ["midshift", "midshift-stop", "midshift-agent"];
 /// What goes with them, files and folders of the repository.
 const BESIDE: [&str; 15] = [
     "ARCHITECTURE.md",
@@ -56,8 +58,9 @@ pub fn dist(workspace: &Workspace, options: &Options) -> Result<bool> {
     ensure!(is_told(&notes, &version), "CHANGELOG.md has no heading \"## {version}\": say first what is in it");
     let to = options.to.clone().unwrap_or_else(|| workspace.target.join(format!("release-{version}")));
     ensure!(!to.exists(), "{} is there already; remove it or name another folder by --to", to.display());
-    let packages = ["build", "--locked", "--profile", "dist", "-p", "midshift", "-p", "midshift-agent", "--bins"];
-    if !run::succeeds(&mut workspace.cargo(&packages))? {
+    let packages = PACKAGES.iter().flat_map(|package| ["-p", package]);
+    let build: Vec<&str> = ["build", "--locked", "--profile", "dist", "--bins"].into_iter().chain(packages).collect();
+    if !run::succeeds(&mut workspace.cargo(&build))? {
         return Ok(false);
     }
     let temporary = Temporary::new()?;
@@ -192,8 +195,12 @@ fn save(
     let said = run::output(docker().args(["run", "--rm", "--network", "none", "--read-only", &midshift, "--version"]));
     let said =
         said.context("the image does not start: were its programs built for newer libraries than its base has?")?;
-    let is_it = said.trim() == format!("{} {version}", PROGRAMS[0]);
-    ensure!(is_it, "an image of a release says its version and nothing else; this one says {:?}", said.trim());
+    let mut beside = docker();
+    beside.args(["run", "--rm", "--network", "none", "--read-only", "--entrypoint", "/usr/local/bin/midshift-stop"]);
+    let beside = run::output(beside.args([&midshift, "--version"])).context("its stop service does not start")?;
+    let (said, wanted) =
+        ([said.trim(), beside.trim()], [PROGRAMS[0], PROGRAMS[1]].map(|name| format!("{name} {version}")));
+    ensure!(said == wanted, "an image of a release says its version and nothing else; this one says {said:?}");
     let mut check = docker();
     check.args(["run", "--rm", "--network", "none", "--entrypoint", "haproxy", &proxy, "-v"]);
     ensure!(run::succeeds(&mut check)?, "the image of the proxy does not start");
@@ -270,7 +277,7 @@ mod tests {
     }
 
     /// Whether an archive would be released whose programs say this.
-    fn judge(folder: &Path, said: [&str; 2]) -> Result<()> {
+    fn judge(folder: &Path, said: [&str; 3]) -> Result<()> {
         let bin = folder.join("it/bin");
         std::fs::create_dir_all(&bin)?;
         for (name, said) in PROGRAMS.into_iter().zip(said) {
@@ -286,13 +293,15 @@ mod tests {
     #[test]
     fn an_archive_is_refused_whose_programs_say_more_or_less_than_their_version() {
         let temporary = Temporary::new().expect("a folder");
-        let (launcher, seeded) = ("midshift-launcher 0.2.0", "midshift 0.2.0 with seeded bugs, for tests only");
-        judge(&temporary.path.join("good"), ["midshift 0.2.0", launcher]).expect("it is a release");
+        let good = ["midshift 0.2.0", "midshift-stop 0.2.0", "midshift-launcher 0.2.0"];
+        judge(&temporary.path.join("good"), good).expect("it is a release");
+        let [midshift, stop, launcher] = good;
         let bad = [
-            [seeded, launcher],
-            ["midshift 0.1.0", launcher],
-            ["midshift 0.2.0", "midshift-launcher 0.2.0 with seeded bugs, for tests only"],
-            ["midshift 0.2.0", ""],
+            ["midshift 0.2.0 with seeded bugs, for tests only", stop, launcher],
+            ["midshift 0.1.0", stop, launcher],
+            [midshift, "midshift-stop 0.1.0", launcher],
+            [midshift, stop, "midshift-launcher 0.2.0 with seeded bugs, for tests only"],
+            [midshift, stop, ""],
         ];
         for (nth, said) in bad.into_iter().enumerate() {
             let refused = judge(&temporary.path.join(nth.to_string()), said).expect_err("it is no release").to_string();

@@ -124,7 +124,8 @@ pub enum Bases {
     OfThisMachine,
 }
 
-/// Builds all of them below `temporary`, with this binary, on the libraries of this machine.
+/// Builds all of them below `temporary`, with this binary and the one of the stop service beside it, on the libraries of
+/// this machine.
 pub fn make(docker: &dyn Fn() -> Command, temporary: &Path, repository: &Path, midshift: &Path) -> Result<Images> {
     let images =
         Images { midshift: "midshift:packed", proxy: "midshift-proxy:packed", postgresql: "midshift-postgres:packed" };
@@ -133,7 +134,8 @@ pub fn make(docker: &dyn Fn() -> Command, temporary: &Path, repository: &Path, m
     Ok(images)
 }
 
-/// Builds midshift and the proxy by the packed stages of deploy/Dockerfile, with this binary, under these names.
+/// Builds midshift and the proxy by the packed stages of deploy/Dockerfile, with this binary and the one of the stop
+/// service beside it, under these names.
 pub fn packed(
     docker: &dyn Fn() -> Command,
     temporary: &Path,
@@ -159,9 +161,13 @@ pub fn packed(
             std::fs::copy(entry.path(), to.join(entry.file_name())).with_context(|| format!("copying {folder}"))?;
         }
     }
-    std::fs::copy(midshift, context.join("midshift")).context("copying midshift")?;
-    // Debug information is four fifths of it, and goes three times through the daemon.
-    run::quietly(Command::new("strip").arg("-g").arg(context.join("midshift")));
+    for (name, program) in
+        [("midshift", midshift.to_owned()), ("midshift-stop", midshift.with_file_name("midshift-stop"))]
+    {
+        std::fs::copy(&program, context.join(name)).with_context(|| format!("copying {}", program.display()))?;
+        // Debug information is four fifths of it, and goes three times through the daemon.
+        run::quietly(Command::new("strip").arg("-g").arg(context.join(name)));
+    }
     for (target, name) in ["packed", "packed-proxy"].into_iter().zip(names) {
         let mut command = docker();
         command.args(["build", "-q"]);

@@ -7,8 +7,9 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The programs under test, built once, and how tests hear of them.
-const PROGRAMS: [(&str, &str); 3] = [
+const PROGRAMS: [(&str, &str); 4] = [
     ("MIDSHIFT_TEST_BIN", "midshift"),
+    ("MIDSHIFT_TEST_STOP", "midshift-stop"),
     ("MIDSHIFT_TEST_LAUNCHER", "midshift-launcher"),
     ("MIDSHIFT_TEST_OWN_ROBOT", "examples/own_robot"),
 ];

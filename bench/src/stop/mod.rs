@@ -31,7 +31,7 @@ const ROBOTS: [usize; 2] = [1_000, 10_000];
 /// Children of this measurement.
 #[derive(Clone, Debug, clap::Subcommand)]
 pub enum Part {
-    /// `midshift stop serve` on a data directory.
+    /// `midshift-stop` on a data directory.
     StopServe {
         /// The data directory.
         #[arg(long)]
@@ -50,16 +50,17 @@ pub async fn play(part: Part, address: SocketAddr, stop: CancellationToken) -> a
     match part {
         Part::StopServe { data } => {
             crate::questions::answer_questions(address, stop.clone(), |_| 0)?;
-            let serve = midshift::stop::StopServe {
+            let serve = midshift_stop::program::Args {
                 site: None,
                 data,
                 listen: address,
                 insecure: false,
                 // All robots of a run come from one address.
                 share: Share { connections_per_address: Some(CONNECTIONS_MAX), ..Share::default() },
+                log: Default::default(),
                 follows: false,
             };
-            midshift::stop::run(serve, stop).await
+            midshift_stop::program::run(serve, stop).await
         }
         Part::Fan => fan::serve(address, stop).await,
         Part::Attend(args) => {

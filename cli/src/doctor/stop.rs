@@ -25,7 +25,7 @@ pub async fn check_stop_service(resolved: &Resolved, address: &str, now: Utc, on
         return vec![Finding::wants_look(
             "stop",
             format!(
-                "no stop service of this site answers at {address}: `midshift stop` reaches nobody; `midshift stop serve`, or --stop-server if it is elsewhere"
+                "no stop service of this site answers at {address}: `midshift stop` reaches nobody; `midshift-stop`, or --stop-server if it is elsewhere"
             ),
         )];
     }

@@ -154,7 +154,7 @@ fn nobody(address: &str, error: &(dyn std::error::Error + 'static)) -> Exit {
     let found = Found::by(error);
     let help = found.help().and_then(|help| help.split_once("\n  try: ")).map(|(_, help)| format!("{help}; or "));
     let text = format!(
-        "no stop service at {address} ({why}): nothing was stopped or reset. Use the robots' own emergency stops if you must\n  try: {}name it with --stop-server, or start one with `midshift stop serve`",
+        "no stop service at {address} ({why}): nothing was stopped or reset. Use the robots' own emergency stops if you must\n  try: {}name it with --stop-server, or start one with `midshift-stop`",
         help.unwrap_or_default()
     );
     Exit::new(found.exit_code(), text)

@@ -5,6 +5,7 @@
 //! operator's `map` commands.
 
 mod draft;
+pub mod file;
 pub mod grid;
 mod lies;
 pub mod lif;

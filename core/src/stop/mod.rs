@@ -19,3 +19,8 @@ pub mod scope;
 pub use latch::{Latch, Reset, Stop};
 pub use region::Region;
 pub use scope::Scope;
+
+/// The folder of the stop service's files, below the data folder of its server.
+pub const FOLDER: &str = "stop";
+/// Port of the stop service, beside the 7420 of the business.
+pub const PORT: u16 = 7421;

@@ -29,14 +29,15 @@ use crate::update::io::UpdateWorker;
 use crate::update::remote::GrpcRemote;
 use crate::update::trust::{self, Trust};
 use midshift_core::ids::{self, RobotId};
+use midshift_core::stop::PORT;
 use midshift_core::time::Clock;
-use std::future::{Future, pending};
+use midshift_os::told_to_end;
+use std::future::Future;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::process::ExitCode;
 use std::sync::Arc;
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::AbortOnDropHandle;
@@ -46,8 +47,6 @@ use tonic::transport::Uri;
 pub const AGENT_FILE: &str = "agent.db";
 /// Variable with the secret that enrols a robot.
 pub const ENROLL: &str = "MIDSHIFT_ENROLL";
-/// Port of the stop service, beside the 7420 of the business.
-pub const STOP_PORT: u16 = 7421;
 
 /// Called once a second while the agent lives.
 pub type Pulse = Box<dyn FnMut() + Send>;
@@ -76,7 +75,7 @@ impl StopFlags {
     /// Where the stop service is for robots of the server at `server`, over TLS or not; none: there is to be no line,
     /// which is said aloud.
     pub fn address(&self, server: &str, is_secure: bool) -> Option<String> {
-        let beside = || is_secure.then(|| stop_service_beside(server, STOP_PORT)).flatten();
+        let beside = || is_secure.then(|| stop_service_beside(server, PORT)).flatten();
         let address = if self.no_stop { None } else { self.stop_server.clone().or_else(beside) };
         match &address {
             Some(address) => {
@@ -365,21 +364,6 @@ fn trust_of_site(data: &Path, identity: Option<&Identity>) -> Result<Option<Path
     match midshift_durable::replace(&path, text.as_bytes()) {
         Ok(()) => Ok(Some(path)),
         Err(source) => Err(Error::File { path, source }),
-    }
-}
-
-/// Returns when the program is told to end: by Ctrl-C or SIGTERM.
-pub async fn told_to_end() {
-    let mut term = match signal(SignalKind::terminate()) {
-        Ok(term) => term,
-        Err(error) => {
-            tracing::warn!(%error, "SIGTERM is not heard");
-            return pending().await;
-        }
-    };
-    tokio::select! {
-        _ = tokio::signal::ctrl_c() => {}
-        _ = term.recv() => {}
     }
 }
 

@@ -3,9 +3,9 @@
 //! Invariant: a key is never in a file that anybody but its owner may read, not even for a moment.
 
 use crate::error::Error;
-use std::fs::{DirBuilder, File, Permissions};
+use std::fs::File;
 use std::io::{self, Read};
-use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 pub use midshift_core::identity::FOLDER;
@@ -14,30 +14,15 @@ pub use midshift_core::identity::FOLDER;
 pub const PRIVATE: u32 = midshift_durable::PRIVATE;
 /// Everybody reads.
 pub const PUBLIC: u32 = 0o644;
-/// What nobody but the owner may have of a folder with keys.
+/// What nobody but the owner may have of a file with keys.
 const OTHERS: u32 = 0o077;
 
-/// What images and repositories put into a folder that is there for something else.
-const PLACEHOLDER: &str = "README";
-
-/// Makes the folder for its owner alone. One that is there and open to others is closed if there is nothing in it yet, as a new volume is, and refused if there
-/// is: somebody may have read it.
+/// Makes the folder for its owner alone; see [`midshift_durable::make_private_folder`].
 ///
 /// # Errors
 /// It cannot be made or looked at, or others may look into it.
 pub fn make_folder(folder: &Path) -> Result<(), Error> {
-    let at = |source| Error::Folder { path: folder.to_owned(), source };
-    DirBuilder::new().recursive(true).mode(0o700).create(folder).map_err(at)?;
-    let mode = folder.metadata().map_err(at)?.permissions().mode();
-    if mode & OTHERS == 0 {
-        return Ok(());
-    }
-    for entry in folder.read_dir().map_err(at)? {
-        if entry.map_err(at)?.file_name() != PLACEHOLDER {
-            return Err(Error::Open { path: folder.to_owned(), mode: mode & 0o777 });
-        }
-    }
-    std::fs::set_permissions(folder, Permissions::from_mode(0o700)).map_err(at)
+    midshift_durable::make_private_folder(folder).map_err(|source| Error::Folder { path: folder.to_owned(), source })
 }
 
 /// The text of a file of its owner's alone; none if there is none. One that others may read is refused, in whatever folder it lies.
@@ -67,29 +52,7 @@ pub fn write(folder: &Path, name: &str, text: &str, mode: u32) -> Result<(), Err
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn mode(folder: &Path) -> u32 {
-        folder.metadata().expect("a folder").permissions().mode() & 0o777
-    }
-
-    #[test]
-    fn a_folder_is_its_owners_alone_and_one_that_others_may_have_read_is_refused_with_what_to_type() {
-        let dir = tempfile::tempdir().expect("a folder");
-        let at = |name: &str| dir.path().join(name);
-        make_folder(&at("made/below")).expect("made");
-        assert_eq!(mode(&at("made/below")), 0o700);
-        for name in ["volume", "used"] {
-            DirBuilder::new().mode(0o755).create(at(name)).expect("a folder");
-            std::fs::set_permissions(at(name), Permissions::from_mode(0o755)).expect("open");
-        }
-        std::fs::write(at("volume/README"), "of the image").expect("written");
-        make_folder(&at("volume")).expect("nothing of ours was in it yet");
-        assert_eq!(mode(&at("volume")), 0o700);
-        std::fs::write(at("used/control.db"), "rows").expect("written");
-        let refused = make_folder(&at("used")).expect_err("others may look into it").to_string();
-        assert!(refused.contains("(mode 755)") && refused.contains(&format!("chmod go= {}", at("used").display())));
-        assert_eq!(mode(&at("used")), 0o755, "that is for a person to decide");
-    }
+    use std::fs::Permissions;
 
     #[test]
     fn a_key_file_that_others_may_read_is_refused_by_its_name_though_its_folder_is_closed() {

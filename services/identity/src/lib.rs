@@ -20,7 +20,8 @@ mod tokens;
 pub use authority::PUBLIC_FILE;
 pub use error::Error;
 pub use files::{FOLDER, make_folder};
-pub use proof::ServerProof;
+pub use midshift_core::identity::ServerProof;
+pub use proof::write_proof;
 pub use retention::prune;
 pub use revocation_list::RevocationList;
 

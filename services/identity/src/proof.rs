@@ -6,7 +6,7 @@
 use crate::authority::asked;
 use crate::register::{Register, written};
 use crate::{Error, files};
-use midshift_core::identity::{Digest, ServerCertificate};
+use midshift_core::identity::{Digest, ServerCertificate, ServerProof};
 use midshift_core::limits;
 use midshift_core::time::Utc;
 use rcgen::{CertificateParams, KeyPair};
@@ -14,37 +14,18 @@ use std::path::Path;
 
 const KEY_FILE: &str = "server.key";
 
-/// Certificate, key and root of a server, PEM.
-#[derive(Clone, PartialEq, Eq)]
-pub struct ServerProof {
-    /// The leaf, and the root behind it.
-    pub chain_pem: String,
-    /// Its private key.
-    pub key_pem: String,
-    /// The root that robots are held against.
-    pub authority_pem: String,
-}
-
-impl ServerProof {
-    /// Writes certificates and key as one file into `folder`, for its owner alone, whole or not at all. Whether it was another one before.
-    ///
-    /// # Errors
-    /// The disk.
-    pub fn write(&self, folder: &Path, name: &str) -> Result<bool, Error> {
-        let text = format!("{}{}", self.chain_pem, self.key_pem);
-        if files::read(folder, name)?.as_ref() == Some(&text) {
-            return Ok(false);
-        }
-        files::write(folder, name, &text, files::PRIVATE)?;
-        Ok(true)
+/// Writes certificates and key as one file into `folder`, for its owner alone, whole or not at all. Whether it was
+/// another one before.
+///
+/// # Errors
+/// The disk.
+pub fn write_proof(proof: &ServerProof, folder: &Path, name: &str) -> Result<bool, Error> {
+    let text = format!("{}{}", proof.chain_pem, proof.key_pem);
+    if files::read(folder, name)?.as_ref() == Some(&text) {
+        return Ok(false);
     }
-}
-
-/// Without the key.
-impl std::fmt::Debug for ServerProof {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("ServerProof").field("authority_pem", &self.authority_pem).finish_non_exhaustive()
-    }
+    files::write(folder, name, &text, files::PRIVATE)?;
+    Ok(true)
 }
 
 /// The key of this process, and what it asks to be called.

@@ -5,19 +5,19 @@
 
 pub mod backup;
 mod changed_map;
-pub mod clock;
 pub mod clock_doubt;
 mod clock_jump;
 pub mod commands;
 mod components;
 mod denials;
 pub mod dev;
-pub mod door;
 pub mod enrol_simulated;
 mod housekeeping;
-pub mod logs;
+#[cfg(test)]
+mod old_connections {
+    mod tests;
+}
 pub mod planning;
-pub mod recorder;
 pub mod robots;
 pub mod serve;
 pub mod server;
@@ -25,6 +25,8 @@ mod software;
 pub mod stop;
 pub mod stop_follower;
 pub mod storage;
+
+pub use midshift_process::{clock, door, logs, recorder};
 
 #[cfg(test)]
 #[path = "../../../tests/src/postgres.rs"]

@@ -8,7 +8,6 @@ use crate::storage::{Database, Storage};
 use crate::{backup, changed_map};
 use crate::{clock, clock_doubt, clock_jump, logs, stop, stop_follower};
 use anyhow::{Context, bail};
-use clap::ValueEnum;
 use midshift_agent::tls;
 use midshift_cli::roles::{Role, Roles};
 use midshift_cli::site_file;
@@ -162,8 +161,7 @@ impl Serve {
 
     /// What holds for the stop service beside it too, as arguments: its port has the same peers, and its log goes where this one's does.
     pub fn for_stop(&self) -> Vec<String> {
-        let log = self.log.to_possible_value().map(|word| format!("--log={}", word.get_name()));
-        self.share.arguments().into_iter().chain(log).collect()
+        self.share.arguments().into_iter().chain(self.log.argument()).collect()
     }
 }
 

@@ -3,7 +3,7 @@
 //! An operational stop request: not a safety function, no performance level. The independent emergency stop is the hardware of the robot's maker and
 //! integrator, whose state midshift shows and never replaces; midshift is not suitable as part of a safety system.
 //!
-//! Called by the binary: [`StopService::open`], [`StopService::routes`], [`StopService::run`] and [`serve`]. Invariant: nothing of the store, the task
+//! Called by its program, [`program`], and by `dev`: [`StopService::open`], [`StopService::routes`], [`StopService::run`] and [`serve`]. Invariant: nothing of the store, the task
 //! queue or another service lies on its way; an engage waits for no robot, and for the disk only with its answer; a folder without its memory, or one that
 //! cannot be read, begins with the fleet stopped. Absent on purpose: who may come in: that is the port's, and is told here only so that it can be recorded.
 
@@ -21,6 +21,8 @@ mod law;
 mod line;
 mod opening;
 mod outbox;
+pub mod port;
+pub mod program;
 mod proof;
 mod robots;
 mod snapshot;

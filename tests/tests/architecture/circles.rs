@@ -14,7 +14,6 @@ const ROLLOUT: &[&str] =
 const AGENT: &[&str] = &[
     "body.rs",
     "bugs.rs",
-    "clock.rs",
     "launcher",
     "sets",
     "storage",

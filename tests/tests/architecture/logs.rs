@@ -81,7 +81,7 @@ const LOGGED: &[(&str, &str, &str)] = &[
     ("services/telemetry/src/facts.rs", "why", "which field breaks which rule, in the words of the decoder"),
     ("services/telemetry/src/session.rs", "why", "which field breaks which rule, in the words of the decoder"),
     ("services/telemetry/src/welcome.rs", "rejection", "one of a closed list of sentences about signed documents"),
-    ("services/midshift/src/logs.rs", "message", "the constant words of a line that was counted"),
+    ("services/process/src/logs.rs", "message", "the constant words of a line that was counted"),
 ];
 
 /// What stands between the brackets of each call of a macro of tracing.

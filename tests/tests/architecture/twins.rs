@@ -179,7 +179,7 @@ fn naive(built: &BTreeSet<String>) -> BTreeSet<&str> {
 #[test]
 fn cargo_builds_no_program_for_use_with_a_naive_rule_and_programs_of_tests_with_all() {
     // `cargo build --release` in the root; and what `cargo xtask dist` builds.
-    for selection in [&[][..], &["-p", "midshift", "-p", "midshift-agent"]] {
+    for selection in [&[][..], &["-p", "midshift", "-p", "midshift-stop", "-p", "midshift-agent"]] {
         let built = built(selection, false);
         assert!(built.iter().any(|line| line.starts_with("midshift-core feature")), "{built:?}");
         assert_eq!(naive(&built), BTreeSet::new(), "{selection:?}");
@@ -191,6 +191,16 @@ fn cargo_builds_no_program_for_use_with_a_naive_rule_and_programs_of_tests_with_
     for file in files("xtask/src", "rs").into_iter().chain(files("deploy", "Dockerfile")) {
         assert!(!read(&file).contains("-features") && !read(&file).contains(FEATURE), "{file}");
     }
+}
+
+#[test]
+fn the_program_of_the_stop_service_has_no_store_in_it() {
+    let store = |built: &BTreeSet<String>| {
+        let names = ["midshift-store ", "midshift-agent ", "sqlx ", "sqlx-core ", "libsqlite3-sys "];
+        names.iter().filter(|name| built.iter().any(|line| line.starts_with(**name))).count()
+    };
+    assert_eq!(store(&built(&["-p", "midshift-stop"], false)), 0);
+    assert_eq!(store(&built(&["-p", "midshift"], false)), 5, "the question can be answered with yes");
 }
 
 #[test]

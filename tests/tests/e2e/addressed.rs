@@ -1,7 +1,7 @@
 //! Which stop service `midshift stop` addresses, with two sites on one machine.
 
 use crate::doors::TERMINAL;
-use crate::harness::{Running, Server, authority, folder, free_port, midshift, sign_in, token, tool};
+use crate::harness::{Running, Server, authority, folder, free_port, midshift, midshift_stop, sign_in, token, tool};
 use crate::secrets::heard;
 use crate::stop_alone::way;
 use crate::stopped::StopServer;
@@ -104,8 +104,8 @@ async fn a_person_at_a_terminal_is_shown_the_site_of_a_stop_service_that_stands_
     let (dir, host) = (folder()?, own_host());
     std::fs::write(dir.path().join("site.toml"), CORRIDOR)?;
     let address = SocketAddr::from((host, 7421));
-    let mut service = Command::new(midshift()?);
-    service.args(["stop", "serve", "--insecure", "--listen", &address.to_string(), "--data"]).arg(dir.path());
+    let mut service = Command::new(midshift_stop()?);
+    service.args(["--insecure", "--listen", &address.to_string(), "--data"]).arg(dir.path());
     service.arg("--site").arg(dir.path().join("site.toml"));
     let _running = Running::start(&mut service, &dir.path().join("stop.log"))?;
     let mut people = StopServiceClient::new(way(address).await?);

@@ -42,6 +42,11 @@ pub fn midshift() -> anyhow::Result<PathBuf> {
     program("MIDSHIFT_TEST_BIN", "midshift")
 }
 
+/// The program of the stop service.
+pub fn midshift_stop() -> anyhow::Result<PathBuf> {
+    program("MIDSHIFT_TEST_STOP", "midshift-stop")
+}
+
 /// A tool of `cargo xtask test --install`.
 pub fn tool(variable: &str) -> anyhow::Result<PathBuf> {
     let path = std::env::var_os(variable)

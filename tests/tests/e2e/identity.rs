@@ -331,7 +331,7 @@ async fn doctor_looks_at_certificates_tokens_rights_and_for_the_stop_service() -
     ensure!(of("exposure").iter().all(|(good, _)| *good) && of("exposure").len() == 2, "{found:?}");
     ensure!(of("disk").len() == 1 && of("clocks")[0] == (true, "the server and this machine agree"), "{found:?}");
     let [(false, stop)] = of("stop")[..] else { anyhow::bail!("{found:?}") };
-    ensure!(stop.contains("midshift stop serve"), "{stop}");
+    ensure!(stop.contains("`midshift-stop`"), "{stop}");
 
     // What the clock jumped before the server was started again is told too.
     let kept = serde_json::json!({ "step_ms": -7_200_000, "to_unix_ms": midshift_agent::clock::wall().0 });

@@ -1,6 +1,6 @@
 //! A stop service by itself: it works when nobody takes what it says, the next one is there before it ends, and `serve` has it there again when it is gone.
 
-use crate::harness::{Running, channel, folder, free_port, midshift, same_site, sign_in_to, until};
+use crate::harness::{Running, channel, folder, free_port, midshift, midshift_stop, same_site, sign_in_to, until};
 use crate::rolled_out::call;
 use anyhow::{Context, ensure};
 use midshift_core::reason::Code;
@@ -12,8 +12,11 @@ use midshift_proto::stop::v1::scope::Scope as W;
 use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
 use midshift_proto::stop::v1::stop_service_client::StopServiceClient;
 use std::collections::BTreeSet;
+use std::fs::Permissions;
 use std::io;
 use std::net::SocketAddr;
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::thread;
@@ -63,8 +66,8 @@ async fn a_stop_service_whose_log_takes_nothing_engages_tells_and_resets() -> an
     let dir = folder()?;
     let address = free_port()?;
     let mut command = Command::new("sh");
-    command.args(["-c", "exec \"$0\" \"$@\" 2>/dev/full"]).arg(midshift()?).env("MIDSHIFT_LOG", "debug");
-    command.args(["stop", "serve", "--insecure", "--listen", &address.to_string(), "--data"]).arg(dir.path());
+    command.args(["-c", "exec \"$0\" \"$@\" 2>/dev/full"]).arg(midshift_stop()?).env("MIDSHIFT_LOG", "debug");
+    command.args(["--insecure", "--listen", &address.to_string(), "--data"]).arg(dir.path());
     let mut running = Running::start(&mut command, &dir.path().join("said.log"))?;
     let channel = way(address).await?;
     let mut line = attend(channel.clone()).await?;
@@ -122,9 +125,16 @@ impl Drop for Children {
 
 /// A stop service of this site, whose log tells processes.
 pub fn stop_service(dir: &Path, address: SocketAddr) -> anyhow::Result<(Running, Children)> {
+    let mut command = Command::new(midshift_stop()?);
+    command.args(["--insecure"]);
+    started(command, dir, address)
+}
+
+/// The same by a command that becomes one.
+fn started(mut command: Command, dir: &Path, address: SocketAddr) -> anyhow::Result<(Running, Children)> {
     std::fs::write(dir.join("site.toml"), DEMO)?;
-    let (mut command, log) = (Command::new(midshift()?), dir.join("stop.log"));
-    command.env("NO_COLOR", "1").args(["stop", "serve", "--insecure", "--listen", &address.to_string(), "--data"]);
+    let log = dir.join("stop.log");
+    command.env("NO_COLOR", "1").args(["--listen", &address.to_string(), "--data"]);
     command.arg(dir.join("data")).arg("--site").arg(dir.join("site.toml"));
     Ok((Running::start(&mut command, &log)?, Children(vec![log])))
 }
@@ -186,6 +196,29 @@ async fn a_next_stop_service_that_cannot_begin_leaves_the_one_that_runs_alone() 
     ensure!(!running.has_ended()?, "it ended");
     // And it is asked again when that is mended.
     std::fs::write(dir.path().join("site.toml"), DEMO)?;
+    running.signal("USR2")?;
+    ensure!(running.ends().await? == Some(0), "the one before ends well");
+    reset(&mut StopServiceClient::new(way(address).await?), &stop_id).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stop_service_that_was_started_as_midshift_stop_serve_is_followed_by_the_program_midshift_stop()
+-> anyhow::Result<()> {
+    let (dir, address) = (folder()?, free_port()?);
+    // As one of before 0.2.0 starts the next one: its own program again, with its own arguments.
+    let [before, then] = ["before", "then"].map(|name| dir.path().join(name));
+    for (program, words) in [(&before, ""), (&then, "stop serve ")] {
+        std::fs::write(program, format!("#!/bin/sh\nexec '{}' {words}\"$@\"\n", midshift()?.display()))?;
+        std::fs::set_permissions(program, Permissions::from_mode(0o755))?;
+    }
+    let mut command = Command::new(midshift_stop()?);
+    command.arg0(&before).args(["--insecure"]);
+    let (mut running, _children) = started(command, dir.path(), address)?;
+    let stop_id = engage(&mut StopServiceClient::new(way(address).await?)).await?;
+    running.signal("USR2")?;
+    says(&dir.path().join("stop.log"), "this one goes on").await?;
+    ensure!(!running.has_ended()?, "arguments of another program are no reason to end");
+    std::fs::rename(&then, &before)?;
     running.signal("USR2")?;
     ensure!(running.ends().await? == Some(0), "the one before ends well");
     reset(&mut StopServiceClient::new(way(address).await?), &stop_id).await

@@ -1,7 +1,9 @@
 //! A fleet stop with real programs: everybody stands, the server dead or not, its database there or not, and nobody moves before a person has reset and resumed
 //! it.
 
-use crate::harness::{Running, Server, channel, folder, free_port, has_login, in_states, midshift, same_site, until};
+use crate::harness::{
+    Running, Server, channel, folder, free_port, has_login, in_states, midshift_stop, same_site, until,
+};
 use crate::kill::{all_over, at_work, judge, submit};
 use crate::robots::{Robots, with_robots};
 use crate::rolled_out::{call, done};
@@ -46,8 +48,8 @@ impl StopServer {
         Ok(server)
     }
     fn run(dir: &Path, address: SocketAddr) -> anyhow::Result<Running> {
-        let mut command = Command::new(midshift()?);
-        command.args(["stop", "serve", "--listen", &address.to_string(), "--data"]).arg(dir.join("data"));
+        let mut command = Command::new(midshift_stop()?);
+        command.args(["--listen", &address.to_string(), "--data"]).arg(dir.join("data"));
         if !has_login(address) {
             command.arg("--insecure");
         }

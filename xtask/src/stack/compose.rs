@@ -35,6 +35,8 @@ pub struct Service {
     pub name: String,
     /// The target of its image in deploy/Dockerfile; none: an image of others.
     pub target: Option<String>,
+    /// Its program, if not that of its image.
+    pub entrypoint: Option<String>,
     /// Arguments of its program.
     pub command: Vec<String>,
     /// Its environment.
@@ -99,6 +101,7 @@ impl Reader<'_> {
         let mut service = Service {
             name: name.to_owned(),
             target: None,
+            entrypoint: None,
             command: Vec::new(),
             environment: BTreeMap::new(),
             depends_on: Vec::new(),
@@ -122,6 +125,10 @@ impl Reader<'_> {
                 let target = merged(hash(value)?)?.into_iter().find(|(key, _)| key == "target");
                 service.target = target.map(|(_, target)| self.text(&target)).transpose()?;
             }
+            "entrypoint" => match self.texts(value)?.as_slice() {
+                [program] => service.entrypoint = Some(program.clone()),
+                _ => bail!("must be [program]; its arguments are `command`"),
+            },
             "command" => service.command = self.texts(value)?,
             "depends_on" => {
                 for (on, how) in merged(hash(value)?)? {
@@ -265,6 +272,7 @@ services:
   one: &one
     <<: *service
     build: {context: ., target: midshift}
+    entrypoint: [/usr/local/bin/other]
     command: [serve, --site, "/sites/${SITE:-demo}", --only, 1..5]
     healthcheck: {test: [CMD, midshift, health], interval: 500ms, retries: 3}
     volumes: ["${SITES:-../sites}:/sites:ro"]
@@ -289,6 +297,7 @@ services:
         assert_eq!(one.health, Some((vec!["midshift".to_owned(), "health".to_owned()], Duration::from_millis(500))));
         assert_eq!((one.grace, one.target.as_deref()), (Duration::from_secs(30), Some("midshift")));
         assert_eq!(one.volumes, [("../sites".to_owned(), "/sites".to_owned())]);
+        assert_eq!(one.entrypoint.as_deref(), Some("/usr/local/bin/other"));
         assert_eq!(two.command, one.command, "merged through two levels");
         assert_eq!(two.environment, variables(&[("OTHER", "7")]), "own keys win whole");
         assert_eq!((two.ports.as_slice(), two.depends_on.as_slice()), (&[(7400, 7401)][..], &["one".to_owned()][..]));
@@ -305,6 +314,7 @@ services:
         assert_eq!(once, [true, false]);
         assert!(why("services: {a: {healthcheck: {test: [CMD-SHELL, x]}}}").contains("[CMD, program"));
         assert!(why("services: {a: {command: [\"$HOME\"]}}").contains("without braces"));
+        assert!(why("services: {a: {entrypoint: [midshift, serve]}}").contains("must be [program]"));
         assert!(why("configs: {}").contains("`configs` is not known"));
         assert!(why("services: {}").contains("no services"));
     }

@@ -12,7 +12,7 @@ use std::time::Duration;
 /// Where the programs of services are.
 #[derive(Clone, Debug)]
 pub struct Programs {
-    /// The program midshift.
+    /// The program midshift; beside it are our other programs.
     pub midshift: PathBuf,
     /// The program HAProxy.
     pub haproxy: PathBuf,
@@ -23,7 +23,7 @@ pub struct Programs {
 /// What a service is here.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// Our binary.
+    /// A program of ours.
     Midshift,
     /// HAProxy with the shipped configuration.
     Proxy,
@@ -92,7 +92,10 @@ fn process(
     let environment = service.environment.iter().map(|(name, value)| (name.clone(), local(value))).collect();
     let command: Vec<String> = service.command.iter().map(local).collect();
     let (program, arguments) = match kind {
-        Kind::Midshift => (programs.midshift.clone(), command),
+        Kind::Midshift => {
+            let other = service.entrypoint.as_deref().and_then(|program| Path::new(program).file_name());
+            (other.map_or_else(|| programs.midshift.clone(), |name| programs.midshift.with_file_name(name)), command)
+        }
         Kind::Proxy => {
             let configuration = root.join("deploy/proxy/haproxy.cfg").to_string_lossy().into_owned();
             (programs.haproxy.clone(), vec!["-W".into(), "-db".into(), "-f".into(), configuration])

@@ -38,7 +38,7 @@ impl Part for Stops {
             }
             ensure!(
                 has_latch && has_key,
-                "{} has lost a file: start `midshift stop serve` once, which stops the fleet since nobody knows any more what was stopped, and take the backup then",
+                "{} has lost a file: start `midshift-stop` once, which stops the fleet since nobody knows any more what was stopped, and take the backup then",
                 from.display()
             );
             private(&folder)?;

@@ -278,7 +278,7 @@ async fn a_backup_has_the_files_of_a_stop_service_that_runs_and_none_of_one_that
     assert!(error.contains("stop/latch is not what was copied") && error.contains("no whole value"), "{error}");
     fs::remove_file(folder.join("latch")).expect("removed");
     let error = back_up(&used.places(), &used.dir.path().join("second"), NOW).await.expect_err("nobody knows");
-    assert!(format!("{error:#}").contains("has lost a file: start `midshift stop serve` once"), "{error:#}");
+    assert!(format!("{error:#}").contains("has lost a file: start `midshift-stop` once"), "{error:#}");
 }
 
 /// A token and a robot that are known at the backup.

@@ -157,7 +157,8 @@ async fn get(args: Get, stop: CancellationToken, out: &Out) -> Result<(), Exit> 
         trust_json: String::new(),
     };
     let identity = IdentityService::open(parts, &stop).await.context("asking for a certificate")?;
-    let is_new = identity.proof().borrow().write(&args.out, FILE).context("writing the certificate")?;
+    let is_new = midshift_identity::write_proof(&identity.proof().borrow(), &args.out, FILE)
+        .context("writing the certificate")?;
     storage.close().await;
     let file = args.out.join(FILE);
     if is_new {

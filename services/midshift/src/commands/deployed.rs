@@ -1,5 +1,4 @@
-//! What operators type by deploy/ and the runbooks, and what one program of ours types for another, is what this program
-//! reads.
+//! What operators type by deploy/ and the runbooks, and what one program of ours types for another, our programs read.
 
 use super::{AgentVerb, Args, Command, logs};
 use clap::{Args as _, FromArgMatches, Parser};
@@ -69,7 +68,7 @@ fn typed(page: &str) -> Vec<Vec<String>> {
         };
         // A digest that a page cuts short, and a program that is built first.
         let line = line.replace("9f3c…", &"9f3c".repeat(16)).replace("cargo run --release -- ", "midshift ");
-        if line.starts_with("midshift ") {
+        if line.starts_with("midshift ") || line.starts_with("midshift-stop ") {
             typed.push(words(&line));
         }
     }
@@ -87,6 +86,10 @@ fn read(words: &[String]) -> Args {
     Args::try_parse_from(words).unwrap_or_else(|error| panic!("{words:?}: {error}")).spread()
 }
 
+fn read_stop(words: &[String]) -> midshift_stop::program::Args {
+    midshift_stop::program::Args::try_parse_from(words).unwrap_or_else(|error| panic!("{words:?}: {error}"))
+}
+
 #[test]
 fn every_unit_starts_a_command_that_there_is_with_arguments_that_it_takes() {
     for (name, unit) in UNITS {
@@ -94,6 +97,10 @@ fn every_unit_starts_a_command_that_there_is_with_arguments_that_it_takes() {
         assert_eq!(started.len(), 1, "{name}");
         for words in started {
             assert!(!words.iter().any(|word| word.contains('$')), "{name}: {words:?}");
+            if words[0].ends_with("/midshift-stop") {
+                read_stop(&words);
+                continue;
+            }
             if words[0].ends_with("/midshift") {
                 read(&words);
                 continue;
@@ -115,7 +122,11 @@ fn every_command_on_a_page_for_operators_is_one_that_there_is_with_arguments_tha
         let typed = typed(page);
         assert!(!typed.is_empty(), "{name}");
         for words in typed {
-            read(&words);
+            if words[0] == "midshift-stop" {
+                read_stop(&words);
+            } else {
+                read(&words);
+            }
         }
     }
 }
@@ -138,11 +149,9 @@ fn the_stop_service_beside_a_server_takes_the_same_peers_and_logs_in_the_same_fo
     let told = |arguments: &[&str]| {
         let words: Vec<String> = ["midshift"].iter().chain(arguments).map(|word| (*word).to_owned()).collect();
         let Command::Serve(serve) = read(&words).command else { panic!("{arguments:?}") };
-        let own =
-            ["midshift", "stop", "serve"].map(str::to_owned).into_iter().chain(serve.for_stop()).collect::<Vec<_>>();
-        let args = read(&own);
-        let Command::Stop(stop) = args.command else { panic!("{own:?}") };
-        (args.log, stop.serves().expect("it serves").share)
+        let own = [&["midshift-stop".to_owned()][..], &serve.for_stop()].concat();
+        let args = read_stop(&own);
+        (args.log, args.share)
     };
     let (log, share) =
         told(&["--log", "json", "serve", "--connections-per-address", "8000", "--requests-per-second", "77"]);

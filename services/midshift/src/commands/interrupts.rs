@@ -1,6 +1,6 @@
 //! Ends what serves when a person or the system asks for it. What only asks has no such token: Ctrl-C ends it at once.
 
-use midshift_agent::program::told_to_end;
+use midshift_os::told_to_end;
 use tokio_util::sync::CancellationToken;
 
 /// A token that Ctrl-C and SIGTERM cancel.

@@ -118,11 +118,15 @@ pub fn main() -> ExitCode {
         let gone = Exit::new(ENVIRONMENT, format!("the launcher that started this agent is not there: {error}"));
         return gone.report(&Out::for_output(args.output));
     }
-    let serves = match &args.command {
-        Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run { .. }) => true,
-        Command::Stop(stop) => stop.serves().is_some(),
-        _ => false,
-    };
+    if let Command::Stop(stop) = &args.command
+        && let Some(arguments) = stop.serves()
+    {
+        // The same process: whoever has started it goes on with its id, its input and its signals.
+        let log = args.log.argument().into_iter();
+        let error = crate::stop::replace_this(&log.chain(arguments.iter().cloned()).collect::<Vec<_>>());
+        return Exit::from(error).report(&Out::of(args.output));
+    }
+    let serves = matches!(&args.command, Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run { .. }));
     logs::start(args.log, if serves { "info" } else { "warn" });
     let out = Out::for_output(args.output);
     let makes_page = matches!(&args.command, Command::Client(command) if command.makes_page());

@@ -15,8 +15,8 @@ const SHARED_FROM: usize = 10;
 const HEAD: &str = "\
 # The command line
 
-Every command of `midshift` with its arguments and exit codes. This page is written from the program itself by
-`cargo xtask golden`; do not edit it.
+Every command of `midshift`, and `midshift-stop`, with arguments and exit codes. This page is written from the programs
+themselves by `cargo xtask golden`; do not edit it.
 
 Results go to stdout and everything else to stderr. `-o json` is the stable contract.
 ";
@@ -170,8 +170,9 @@ fn count(command: &Command, counted: &mut BTreeMap<String, usize>) {
     verbs(command).into_iter().for_each(|verb| count(verb, counted));
 }
 
-fn write_command(command: &Command, path: &str, depth: usize, shared: &BTreeMap<String, usize>, page: &mut String) {
-    let _infallible = write!(page, "\n{} midshift {path}\n", "#".repeat(depth));
+/// Writes one command and those below it; `line` is what people type, from the name of the program on.
+fn write_command(command: &Command, line: &str, depth: usize, shared: &BTreeMap<String, usize>, page: &mut String) {
+    let _infallible = write!(page, "\n{} {line}\n", "#".repeat(depth));
     let about = command.get_long_about().or_else(|| command.get_about()).map(ToString::to_string).unwrap_or_default();
     for paragraph in about.split("\n\n") {
         *page += "\n";
@@ -206,7 +207,7 @@ fn write_command(command: &Command, path: &str, depth: usize, shared: &BTreeMap<
     }
     let ends: Vec<String> = EXIT_CODES
         .iter()
-        .filter(|(.., commands)| commands.contains(&path))
+        .filter(|(.., commands)| line.strip_prefix("midshift ").is_some_and(|path| commands.contains(&path)))
         .map(|(code, meaning, _)| format!("{code} ({meaning})"))
         .collect();
     if !ends.is_empty() {
@@ -214,7 +215,7 @@ fn write_command(command: &Command, path: &str, depth: usize, shared: &BTreeMap<
         *page += &wrapped(&format!("Its own exit codes: {}.", ends.join("; ")), "");
     }
     for verb in verbs(command) {
-        write_command(verb, &format!("{path} {}", verb.get_name()), depth + 1, shared, page);
+        write_command(verb, &format!("{line} {}", verb.get_name()), depth + 1, shared, page);
     }
 }
 
@@ -234,8 +235,11 @@ fn page() -> String {
     page += "\n## Options of many commands\n\n";
     shared.keys().for_each(|item| page += item);
     for command in verbs(&whole) {
-        write_command(command, command.get_name(), 2, &shared, &mut page);
+        write_command(command, &format!("midshift {}", command.get_name()), 2, &shared, &mut page);
     }
+    let mut stop = midshift_stop::program::Args::command();
+    stop.build();
+    tell(&stop, "midshift-stop", 2, &shared, &mut page);
     page
 }
 
@@ -282,7 +286,7 @@ fn every_line_of_the_page_is_one_that_people_can_read() {
         assert!(page.contains(choice), "{choice}");
     }
     for command in
-        ["## midshift dev", "### midshift task submit", "### midshift rollout wait", "#### midshift bundle root rotate"]
+        ["## midshift dev", "### midshift task submit", "#### midshift bundle root rotate", "## midshift-stop"]
     {
         assert!(page.lines().any(|line| line == command), "{command}");
     }

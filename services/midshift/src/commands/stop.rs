@@ -1,7 +1,7 @@
-//! `midshift stop …`: runs the stop service, checks its files, or asks one that runs.
+//! `midshift stop …`: asks the stop service that runs, checks its files, or becomes one.
 
 use super::interrupts::interrupts;
-use crate::stop::{FOLDER, StopServe};
+use crate::stop::FOLDER;
 use clap::{Args, Subcommand};
 use midshift_cli::Command;
 use midshift_cli::client::Exit;
@@ -34,15 +34,20 @@ enum Verb {
         #[arg(long, default_value = "midshift-data")]
         data: PathBuf,
     },
-    /// Run the stop service: a process of its own beside `midshift serve`, with its own port and files.
-    Serve(StopServe),
+    /// Become the stop service: the program midshift-stop that lies beside this one, with these arguments.
+    #[command(disable_help_flag = true)]
+    Serve {
+        /// As for the program midshift-stop.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<String>,
+    },
 }
 
 impl Stop {
-    /// What to serve, if that is what was asked for.
-    pub fn serves(&self) -> Option<&StopServe> {
+    /// Arguments of the stop service, if that is what is to run.
+    pub fn serves(&self) -> Option<&[String]> {
         match &self.verb {
-            Some(Verb::Serve(args)) => Some(args),
+            Some(Verb::Serve { arguments }) => Some(arguments),
             _ => None,
         }
     }
@@ -54,7 +59,7 @@ pub async fn run(stop: Stop, out: &Out) -> Result<(), Exit> {
         None => Request::Engage(stop.engage),
         Some(Verb::Ask(verb)) => Request::Of(verb),
         Some(Verb::Verify { data }) => return verify(&data.join(FOLDER), out),
-        Some(Verb::Serve(args)) => return Ok(crate::stop::run(args, interrupts()).await?),
+        Some(Verb::Serve { .. }) => unreachable!("runs before the runtime"),
     };
     midshift_cli::run(Command::Stop(Box::new(request)), out).await
 }
@@ -92,7 +97,10 @@ mod tests {
         assert!(parse("--all --reason drill").is_ok_and(|line| line.stop.verb.is_none()));
         let watches = |line: Line| matches!(line.stop.verb, Some(Verb::Ask(stop::Verb::Status { watch: true, .. })));
         assert!(parse("status --watch").is_ok_and(watches));
-        assert!(parse("serve").is_ok_and(|line| line.stop.serves().is_some()));
+        let serves = ["--site", "a.toml", "--help"];
+        assert!(
+            parse("serve --site a.toml --help").is_ok_and(|line| line.stop.serves().is_some_and(|all| all == serves))
+        );
         assert!(parse("").is_err() && parse("--all status").is_err());
     }
 }

@@ -3,7 +3,7 @@
 //! Invariant: only one that answered nothing three times is ended, the process that holds the folder, once in 30 s; beyond that a person is told.
 //! What it says goes to a file of its own: it must not depend on where the server's own words go.
 
-use super::program::{LOOK_EVERY, UP_WITHIN, program};
+use super::program;
 use crate::clock;
 use anyhow::{Context, bail};
 use midshift_agent::dial::{Dial, TcpDial};
@@ -16,6 +16,7 @@ use midshift_core::rows::{Fact, Item, Log, Writer};
 use midshift_core::stop::hung::{Answer, Hung, Look, Verdict};
 use midshift_core::time::{Clock, LinkTime};
 use midshift_stop::NotEnded;
+use midshift_stop::program::UP_WITHIN;
 use midshift_store::Store;
 use std::fs::{DirBuilder, File, OpenOptions};
 use std::future::pending;
@@ -33,6 +34,8 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
+/// How often it is looked whether one that was started answers.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// In its folder: what a stop service says that `serve` has started.
 pub const LOG: &str = "log";
 /// One that has more than this begins anew, bytes.
@@ -65,19 +68,38 @@ impl Started {
     /// Starts it as a process that outlives this one, unless one of this site answers already. None: one does.
     ///
     /// # Errors
-    /// It did not come up: no `serve` without a way to stop robots, unless `--no-stop` says that it is elsewhere.
+    /// Its program is missing or of another version, or it did not come up: no `serve` without a way to stop robots,
+    /// unless `--no-stop` says that it is elsewhere.
     pub async fn start(&self) -> anyhow::Result<Option<Child>> {
+        let program = program::find()?;
+        program::check_version(&program).await?;
+        self.start_program(&program).await
+    }
+
+    /// The same for one that is gone, whichever version lies there now: robots wait for it.
+    async fn start_again(&self) -> anyhow::Result<Option<Child>> {
+        let program = program::find()?;
+        let child = self.start_program(&program).await?;
+        if child.is_some()
+            && let Err(error) = program::check_version(&program).await
+        {
+            tracing::warn!(error = format!("{error:#}"), "the stop service was started again all the same");
+        }
+        Ok(child)
+    }
+
+    async fn start_program(&self, program: &Path) -> anyhow::Result<Option<Child>> {
         let listen = self.listen;
         if self.answers().await {
             tracing::info!(address = %listen, "a stop service answers already and is left alone");
             return Ok(None);
         }
-        let mut child = self.spawn()?;
+        let mut child = self.spawn(program)?;
         let mut waited = Duration::ZERO;
         while !self.answers().await {
             if let Some(status) = child.try_wait()? {
                 bail!(
-                    "the stop service ended at once ({status}); what it said is in {}. `midshift stop serve` by itself shows it too; --no-stop if it runs elsewhere",
+                    "the stop service ended at once ({status}); what it said is in {}. `midshift-stop` by itself shows it too; --no-stop if it runs elsewhere",
                     self.data.join(FOLDER).join(LOG).display()
                 );
             }
@@ -94,9 +116,9 @@ impl Started {
         Ok(Some(child))
     }
 
-    fn spawn(&self) -> anyhow::Result<Child> {
-        let mut command = Command::new(program()?);
-        command.args(["stop", "serve", "--listen", &self.listen.to_string(), "--data"]).arg(&self.data);
+    fn spawn(&self, program: &Path) -> anyhow::Result<Child> {
+        let mut command = Command::new(program);
+        command.args(["--listen", &self.listen.to_string(), "--data"]).arg(&self.data);
         if let Some(site) = &self.site {
             command.arg("--site").arg(site);
         }
@@ -108,7 +130,7 @@ impl Started {
         let said = log(&self.data.join(FOLDER)).map_or_else(|_| Stdio::null(), Stdio::from);
         // A group of its own: neither Ctrl-C at a terminal nor a kill of this group reaches it.
         command.process_group(0).stdin(Stdio::null()).stdout(Stdio::null()).stderr(said);
-        command.spawn().context("starting the stop service")
+        command.spawn().with_context(|| format!("starting {}", program.display()))
     }
 
     /// Looks after it until the task is ended: one that is gone is started again, before robots among people slow down for want of an answer. `child`: what
@@ -126,7 +148,7 @@ impl Started {
             pause = if begun.elapsed() >= LIVED { Duration::ZERO } else { longer(pause) };
             tracing::error!(address = %self.listen, "the stop service does not answer and is started again");
             sleep(pause).await;
-            child = match self.start().await {
+            child = match self.start_again().await {
                 Ok(started) => started,
                 Err(error) => {
                     tracing::error!(%error, "the stop service was not started");

@@ -1,9 +1,10 @@
 //! Old connections from the door to the robot: the port tells the service, the service tells the robot, and the robot's next session is a succession.
 
-use super::*;
-use midshift_core::ids::RobotId;
+use crate::door::{alone, serve};
+use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::time::Clock;
 use midshift_core::time::{LinkDuration, ScaledClock, Utc};
-use midshift_edge::Age;
+use midshift_edge::{Age, Config};
 use midshift_proto::convert::stop::{FromStop, ToStop};
 use midshift_proto::link::v1::SessionRequest;
 use midshift_proto::link::v1::link_service_client::LinkServiceClient;
@@ -12,11 +13,14 @@ use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
 use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, StoreId};
 use midshift_telemetry::TelemetryService;
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
+use tokio_util::sync::CancellationToken;
 use tonic::Streaming;
+use tonic::service::Routes;
 use tonic::transport::Channel;
 
 async fn within<T>(work: impl Future<Output = T>) -> T {

@@ -1,7 +1,7 @@
 //! The clocks of a real process: tokio's monotonic clock, so that a simulation can own it, and the wall's UTC, read
 //! whenever the time is asked for.
 //!
-//! Called by programs, at their start: by [`crate::program`], and by the binary for its servers.
+//! Called by programs, at their start.
 
 use midshift_core::time::{Clock, Jump, Utc};
 use midshift_core::wall::WallClock;

@@ -3,10 +3,9 @@
 //! Both have the same open port, which the next one gets as its standard input: whoever dials between them waits a moment and is refused by nobody. Invariant:
 //! a next one that cannot begin costs nothing, this one goes on; two never have the folder at once.
 
-use super::manager;
-use super::program::{UP_WITHIN, program};
+use super::{UP_WITHIN, manager};
+use crate::StopService;
 use anyhow::{Context, anyhow, bail, ensure};
-use midshift_stop::StopService;
 use std::env;
 use std::fs::File;
 use std::io::{self, Write};
@@ -74,7 +73,7 @@ pub async fn begun(mut asked: Signal, port: &OwnedFd, service: &StopService) {
 async fn start(port: &OwnedFd, service: &StopService) -> anyhow::Result<u32> {
     // With it the container would end.
     ensure!(std::process::id() != 1, "the first process of a container is replaced with its container");
-    let mut command = Command::new(program()?);
+    let mut command = Command::new(midshift_os::program().context("finding this program")?);
     command.args(env::args_os().skip(1).filter(|argument| argument != FOLLOWS)).arg(FOLLOWS);
     command.stdin(Stdio::from(port.try_clone()?)).stdout(Stdio::piped());
     let mut next = Next(Some(command.spawn().context("starting it")?));

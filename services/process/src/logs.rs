@@ -27,6 +27,14 @@ pub enum Format {
     Json,
 }
 
+impl Format {
+    /// The same as an argument of a program of ours; none: it is what a program does by itself.
+    pub fn argument(self) -> Option<String> {
+        let word = self.to_possible_value().filter(|_| self != Self::default());
+        word.map(|word| format!("--log={}", word.get_name()))
+    }
+}
+
 /// Starts logging. `default` is the level where the environment says nothing.
 pub fn start(format: Format, default: &str) {
     let filter = EnvFilter::try_from_env("MIDSHIFT_LOG").unwrap_or_else(|_| EnvFilter::new(default));

@@ -1,16 +1,15 @@
 //! The door of a port: an edge around its services, and who may come in: everybody in plain text (`dev`), or whom identity knows, over TLS.
 //!
-//! Invariant: every port of the binary has this door and no other; what a request may do was decided before a service sees it.
+//! Invariant: every port of our programs has this door and no other; what a request may do was decided before a service sees it.
 
 use anyhow::Context;
 use midshift_core::Boxed;
-use midshift_core::identity::Directory;
+use midshift_core::identity::{Directory, ServerProof};
 use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_edge::tls::{Clients, server_config};
 use midshift_edge::{Anybody, Config, Denials, Edge, Known, Listen, Listener, Rate, connections_max};
-use midshift_identity::ServerProof;
 use rustls::ServerConfig;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
@@ -169,6 +168,3 @@ fn tls(proof: &ServerProof, clock: &Arc<dyn Clock>) -> anyhow::Result<Arc<Server
     let roots = certificates(&proof.authority_pem).context("reading the site's root")?;
     server_config(chain, key, Clients::Asked(roots), clock).context("what the server proves itself with")
 }
-
-#[cfg(test)]
-mod tests;

@@ -1,10 +1,10 @@
 //! The process' clocks, by the site's rate: the machine's own, or a scaled one of a simulation.
 
-use midshift_agent::clock::{micros, real};
 use midshift_core::time::{Clock, ScaledClock, Utc};
+use midshift_os::clock::{micros, real};
 use std::sync::Arc;
 
-pub use midshift_agent::clock::wall;
+pub use midshift_os::clock::wall;
 
 /// Clocks that start now; the site clock runs `rate_permille` thousandths of real time. One that is not real is a simulation's own, with its wall.
 pub fn clock(rate_permille: u32) -> Arc<dyn Clock> {
