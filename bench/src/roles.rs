@@ -149,6 +149,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
                 no_faults: true,
                 listen: None,
                 trust: None,
+                replace: false,
                 identity: IdentityFlags::default(),
                 stop: StopFlags::default(),
             };

@@ -5,12 +5,12 @@
 
 #[path = "architecture/circles.rs"]
 mod circles;
+#[path = "architecture/dependencies.rs"]
+mod dependencies;
 #[path = "architecture/logs.rs"]
 mod logs;
 #[path = "architecture/newer_words.rs"]
 mod newer_words;
-#[path = "architecture/dependencies.rs"]
-mod dependencies;
 #[path = "architecture/pages.rs"]
 mod pages;
 #[path = "architecture/serde_types.rs"]

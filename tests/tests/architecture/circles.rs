@@ -9,8 +9,7 @@ use std::collections::BTreeSet;
 /// Rooms, from the lowest to the highest: each uses only those before it.
 const FLEET: &[&str] =
     &["projection", "decision", "tasks", "traffic", "facts", "assignment", "maintenance", "explanation"];
-const ROLLOUT: &[&str] =
-    &["projection", "decision", "members", "judgement", "robots", "phases", "facts", "commands"];
+const ROLLOUT: &[&str] = &["projection", "decision", "members", "judgement", "robots", "phases", "facts", "commands"];
 const AGENT: &[&str] = &[
     "body.rs",
     "bugs.rs",

@@ -52,7 +52,11 @@ const LOGGED: &[(&str, &str, &str)] = &[
     ("robot_agent/src/core/update/beliefs.rs", "rejection", "one of a closed list of sentences about signed documents"),
     ("robot_agent/src/core/update/beliefs.rs", "keys", "digests"),
     ("robot_agent/src/core/update/integrity.rs", "sets", "digests"),
-    ("robot_agent/src/core/update/integrity.rs", "why", "which file of a set has which digest, in sentences of this program"),
+    (
+        "robot_agent/src/core/update/integrity.rs",
+        "why",
+        "which file of a set has which digest, in sentences of this program",
+    ),
     ("robot_agent/src/update/io.rs", "base", "a digest"),
     ("robot_agent/src/core/update/results.rs", "why", "what the transport or a disk said"),
     ("robot_agent/src/core/update/record.rs", "from", "one of a closed list of states"),

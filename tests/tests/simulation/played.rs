@@ -229,7 +229,7 @@ impl Game {
 
     fn judge(&self) {
         let verdict = self.room.hall.verdict();
-        let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).oracle().drops_by_task();
+        let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).judge().drops_by_task();
         let mut seen = self.room.observer.look();
         match verdict {
             Ok(verdict) => {
@@ -271,7 +271,7 @@ impl Game {
     /// Laws of a moment.
     fn look(&mut self) {
         let metrics = counted();
-        let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).oracle().drops_by_task();
+        let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).judge().drops_by_task();
         let mut seen = self.room.observer.look();
         incidents::are_open_and_few(&self.room.store, &mut seen);
         counted::nothing_stands_unexplained(&metrics, &mut seen);

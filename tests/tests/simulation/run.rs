@@ -227,7 +227,7 @@ impl Shift {
     fn judge(&self) -> anyhow::Result<()> {
         let verdict = self.room.hall.verdict()?;
         let refused = self.room.desk.refused.borrow();
-        let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).oracle().drops_by_task();
+        let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).judge().drops_by_task();
         let mut seen = self.room.observer.look();
         counted::nothing_stands_unexplained(&counted::counted(), &mut seen);
         incidents::nobody_is_blamed(&self.room.store, &mut seen);

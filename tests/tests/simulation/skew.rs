@@ -160,7 +160,7 @@ impl Shift {
             let tasks = seen.tasks();
             room.desk.is_empty() && tasks.len() == 2 * TASKS && tasks.values().all(|task| task.phase.is_terminal())
         });
-        let drops = lock(&scene.room.hall.worlds()[0]).oracle().drops_by_task();
+        let drops = lock(&scene.room.hall.worlds()[0]).judge().drops_by_task();
         for task in scene.room.observer.look().tasks().values() {
             let done = (task.phase, drops.get(&task.task_id).copied());
             assert_eq!(done, (TaskPhase::Succeeded, Some(1)), "{:?}: {task:?}", self.pair);

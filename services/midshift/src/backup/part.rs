@@ -5,17 +5,6 @@ use midshift_core::time::Utc;
 use midshift_store::{PostgresConfig, PostgresRestore, StoreId};
 use std::path::{Path, PathBuf};
 
-/// Where a server keeps what is durable.
-#[derive(Clone, Debug)]
-pub struct Places {
-    /// Its data directory.
-    pub data: PathBuf,
-    /// The folder of its online keys, if it has any.
-    pub ota_keys: Option<PathBuf>,
-    /// The database of its rows; none: they are files of SQLite in the data directory.
-    pub store: Option<PostgresConfig>,
-}
-
 /// Name of the part of online keys, and of the folder where they go if nobody says where.
 pub const KEYS: &str = "ota-keys";
 /// Name of the part of rows in PostgreSQL. A backup without it has rows of SQLite.

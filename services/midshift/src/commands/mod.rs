@@ -124,7 +124,7 @@ pub fn main() -> ExitCode {
         // The same process: whoever has started it goes on with its id, its input and its signals.
         let log = args.log.argument().into_iter();
         let error = crate::stop::replace_this(&log.chain(arguments.iter().cloned()).collect::<Vec<_>>());
-        return Exit::from(error).report(&Out::of(args.output));
+        return Exit::from(error).report(&Out::for_output(args.output));
     }
     let serves = matches!(&args.command, Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run { .. }));
     logs::start(args.log, if serves { "info" } else { "warn" });

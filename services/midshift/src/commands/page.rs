@@ -239,7 +239,7 @@ fn page() -> String {
     }
     let mut stop = midshift_stop::program::Args::command();
     stop.build();
-    tell(&stop, "midshift-stop", 2, &shared, &mut page);
+    write_command(&stop, "midshift-stop", 2, &shared, &mut page);
     page
 }
 

@@ -1,6 +1,5 @@
 //! `midshift stop …`: asks the stop service that runs, checks its files, or becomes one.
 
-use super::interrupts::interrupts;
 use crate::stop::FOLDER;
 use clap::{Args, Subcommand};
 use midshift_cli::Command;
