@@ -56,10 +56,10 @@ pub enum Command {
     /// Stops: the program itself parses `stop`, which has a verb that serves.
     #[command(skip)]
     Stop(Box<stop::Request>),
-    /// Tasks.
+    /// Tasks: submit, look at, cancel, retry.
     #[command(subcommand)]
     Task(task::Verb),
-    /// Robots.
+    /// Robots: look at, take out of work, enrol.
     #[command(subcommand)]
     Robot(robot::Verb),
     /// Let robots and tasks go on that stand held, after their stop was reset: `midshift resume --stop ID`.

@@ -58,7 +58,7 @@ impl Giver {
 /// The stop service that is meant.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Target {
-    /// host:port.
+    /// Where it listens, as `host:port`.
     pub address: String,
     /// The site that it must be of. Empty: nobody has said.
     pub site_id: String,

@@ -11,7 +11,6 @@ pub mod launcher_heartbeat;
 
 use crate::body::Body;
 use crate::bugs::Bugs;
-use crate::clock;
 use crate::core::ExitReason;
 use crate::launcher::{self, ENVIRONMENT, SWITCHED};
 use crate::session::{self, AgentConfig, Lines, Updates};
@@ -31,6 +30,7 @@ use crate::update::trust::{self, Trust};
 use midshift_core::ids::{self, RobotId};
 use midshift_core::stop::PORT;
 use midshift_core::time::Clock;
+use midshift_os::clock;
 use midshift_os::told_to_end;
 use std::future::Future;
 use std::io;

@@ -23,6 +23,7 @@ const AGENT: &[&str] = &[
     "session",
     "program",
     "lib.rs",
+    "bin",
 ];
 
 /// Files that lead back to themselves.
