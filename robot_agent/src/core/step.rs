@@ -93,7 +93,7 @@ impl AgentCore {
             applied_work: self.kept.ledger.applied.work,
             applied_policy: self.kept.ledger.applied.policy,
             applied_update: self.kept.ledger.applied.update,
-            produced: Lane::ALL.into_iter().map(|lane| (lane, self.produced(lane))).collect(),
+            produced: Lane::ALL.into_iter().map(|lane| (lane, self.kept.ring.lane(lane).produced)).collect(),
             mode: self.mode,
             vitals: self.vitals(now),
             load: self.body.load(),
@@ -109,12 +109,6 @@ impl AgentCore {
             fault: self.unfit.as_ref().or(self.standing_fault.as_ref()).cloned(),
             update: self.update_report().filter(|u| session.is_none() || !u.state.is_over()),
         }
-    }
-
-    /// Highest number of a lane that explains what is reported now: events that wait for their turn are counted, since
-    /// the report shows already what they will say.
-    fn produced(&self, lane: Lane) -> u64 {
-        self.kept.ring.lane(lane).produced + self.throttle.waiting(lane)
     }
 
     /// The process ends: nobody drives the body any more, so it stands.

@@ -61,11 +61,6 @@ impl Throttle {
         Some((next.lane, told(next.event, next.more)))
     }
 
-    /// Events of a lane that wait: each will have a number of its own.
-    pub fn waiting(&self, lane: Lane) -> u64 {
-        self.waiting.iter().filter(|waiting| waiting.lane == lane).count() as u64
-    }
-
     /// When the next one may be written, if any waits.
     pub fn next_at(&self) -> Option<LinkTime> {
         let missing = 1000u64.saturating_sub(self.milli_tokens);
@@ -133,7 +128,6 @@ mod tests {
         }
         assert_eq!(out.len(), 50);
         assert_eq!(throttle.next_at(), Some(LinkTime(20)));
-        assert_eq!([Lane::Critical, Lane::Event].map(|lane| throttle.waiting(lane)), [1, 10]);
         while let Some((_, event)) = throttle.ready(LinkTime(1_000)) {
             out.push(event);
         }

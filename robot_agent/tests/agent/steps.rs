@@ -1,12 +1,10 @@
 //! Steps: what is done, in which order, and how it ends.
 
-use crate::rig::{Rig, action, goto, items, point, step};
+use crate::rig::{Rig, action, goto, point, step};
 use midshift_agent::body::{BodyNews, Checked};
 use midshift_agent::core::Input;
-use midshift_core::robot::{FAULT_TIMEOUT, Fault, FaultClass, Lane, Load};
-use midshift_core::work::{
-    Assignment, DesiredWork, Effect, InboxItem, RobotEvent, SampleBody, StepKind, WorkState, WorkStep,
-};
+use midshift_core::robot::{FAULT_TIMEOUT, Fault, FaultClass, Load};
+use midshift_core::work::{Assignment, DesiredWork, Effect, RobotEvent, StepKind, WorkState, WorkStep};
 
 fn fault(code: u32) -> Fault {
     Fault { code, class: FaultClass::Recoverable, message: String::new() }
@@ -32,32 +30,6 @@ fn work_that_ends_at_once_again_and_again_makes_no_flood_of_heartbeats() {
     let ended = rig.states().iter().filter(|(s, _)| *s == WorkState::Succeeded).count();
     assert!(ended > 20, "{ended} ended");
     assert!((2..=5).contains(&(rig.hb - before)), "{} heartbeats in a second", rig.hb - before);
-}
-
-/// Numbers of the events that say an attempt failed.
-fn failures(rig: &Rig) -> Vec<u64> {
-    let seq = |item: &InboxItem| {
-        let InboxItem::Sample(sample) = item else { return None };
-        let SampleBody::Event(RobotEvent::Attempt(report)) = &sample.body else { return None };
-        (report.state == WorkState::Failed).then_some(sample.seq)
-    };
-    items(&rig.messages, Lane::Event).iter().filter_map(seq).collect()
-}
-
-#[test]
-fn a_heartbeat_counts_the_end_that_it_lists_while_that_waits_behind_other_messages() {
-    let mut rig = accepted(vec![action("pick", Effect::Repeatable)]);
-    rig.pass(1_000);
-    (1..=80).for_each(|code| rig.body.says(BodyNews::Fault(fault(code), true)));
-    rig.body.says(BodyNews::Failed(fault(1002)));
-    rig.give(Input::Tick);
-    rig.ms += 250;
-    rig.give(Input::Tick);
-    let listed = rig.reported.clone().expect("a heartbeat");
-    assert!(listed.attempts.iter().any(|attempt| attempt.state == WorkState::Failed), "{:?}", listed.attempts);
-    assert!(failures(&rig).is_empty(), "it waits");
-    rig.pass(2_000);
-    assert_eq!(failures(&rig), [listed.produced[&Lane::Event]], "nothing counts before that event has come");
 }
 
 #[test]
