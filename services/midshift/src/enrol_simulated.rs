@@ -70,14 +70,17 @@ impl Replaced {
                 new.insert(robot_id.as_str());
             }
         }
+        if new.is_empty() {
+            // All go on with what they have, also while nobody hands out certificates.
+            return Ok(Self(BTreeSet::new()));
+        }
         let mut client = IdentityServiceClient::new(identities.lazy());
         let mut request = ListRobotIdentitiesRequest { page_size: PAGE_SIZE, ..Default::default() };
         let mut taken = BTreeMap::new();
         loop {
             let page = client.list_robot_identities(request.clone()).await.context("asking who is enrolled")?;
             let page = page.into_inner();
-            let has_machine = |robot: &&RobotIdentity| !robot.key_sha256.is_empty() && new.contains(&*robot.robot_id);
-            for robot in page.robots.iter().filter(has_machine) {
+            for robot in page.robots.iter().filter(|robot| is_taken(robot) && new.contains(&*robot.robot_id)) {
                 let enrolled = robot.enrol_time.as_ref().map_or(Utc(i64::MAX), time_of);
                 taken.insert(RobotId::parse(&robot.robot_id)?, enrolled);
             }
@@ -105,6 +108,11 @@ impl Replaced {
         ensure!(strangers.is_empty(), refusal(&strangers));
         Ok(Self(taken.into_keys().collect()))
     }
+}
+
+/// Whether a machine has the robot's name, had it until a person revoked it, or has a secret to get it.
+fn is_taken(robot: &RobotIdentity) -> bool {
+    !robot.key_sha256.is_empty() || robot.revoke_time.is_some() || robot.enrolment_expire_time.is_some()
 }
 
 /// Whether the machine that was enrolled then said at its Hello that its body is simulated. What an older machine of

@@ -176,6 +176,10 @@ pub fn run(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> Boxed<'_, 
 async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow::Result<()> {
     let roles = Roles::from_names(&args.roles);
     check_arguments(&args, &roles)?;
+    if !args.no_stop && !roles.are_split() {
+        // Before rows are brought to this version, from which the one before could not go on.
+        stop::check_program().await?;
+    }
     // Before anything is opened: whoever finds the port taken leaves no trace.
     let listener = listen(args.listen).await?;
     if !args.insecure {

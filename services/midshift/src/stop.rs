@@ -11,7 +11,7 @@ mod started;
 
 pub use first_start::{Occasion, announce};
 pub use midshift_core::stop::{FOLDER, PORT};
-pub use program::replace_this;
+pub use program::{check_program, replace_this};
 pub use started::{LOG, Started};
 
 use crate::{door, recorder};

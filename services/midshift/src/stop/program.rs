@@ -42,6 +42,14 @@ fn beside(programs: &[&Path]) -> anyhow::Result<PathBuf> {
     })
 }
 
+/// Refuses to begin beside a program that is missing or of another version.
+///
+/// # Errors
+/// As of [`find`] and [`check_version`].
+pub async fn check_program() -> anyhow::Result<()> {
+    check_version(&find()?).await
+}
+
 /// Refuses a program of another version.
 ///
 /// # Errors

@@ -71,9 +71,8 @@ impl Started {
     /// Its program is missing or of another version, or it did not come up: no `serve` without a way to stop robots,
     /// unless `--no-stop` says that it is elsewhere.
     pub async fn start(&self) -> anyhow::Result<Option<Child>> {
-        let program = program::find()?;
-        program::check_version(&program).await?;
-        self.start_program(&program).await
+        program::check_program().await?;
+        self.start_program(&program::find()?).await
     }
 
     /// The same for one that is gone, whichever version lies there now: robots wait for it.
