@@ -1,7 +1,8 @@
 //! Runs end-to-end tests: each in a process of its own, the longest of the last run first, as many at once as there are permits.
 //!
 //! Invariants:
-//! 1. A test is started when it has its permits, in the order of the list: what it waits for them counts for none of its limits.
+//! 1. A test is started when it has its permits, in the order of the list, but for one small test beside heavy ones: what it waits for
+//!    them counts for none of its limits.
 //! 2. Split stacks, and what else starts many programs, take several permits, so that two of them at most run at once on two cores.
 //! 3. Tests that run at once have no port in common, also while a server of one is started again.
 //! 4. A test that does not end is ended with all that it started, and has failed.
@@ -104,9 +105,16 @@ impl Unit {
     }
 }
 
-/// The first in the queue, if so many permits are enough for it: nobody overtakes.
-fn granted(queue: &mut VecDeque<Unit>, free: usize) -> Option<Unit> {
-    queue.front().is_some_and(|unit| unit.permits <= free).then(|| queue.pop_front()).flatten()
+/// The first in the queue, if so many permits are enough for it. Else a small one may overtake, unless one runs (`is_passed`): the
+/// first never waits for it, since none takes all permits but on one core.
+fn granted(queue: &mut VecDeque<Unit>, free: usize, is_passed: bool) -> Option<Unit> {
+    let fits = |unit: &Unit| unit.permits <= free;
+    let next = match queue.front() {
+        Some(first) if fits(first) => 0,
+        _ if is_passed => return None,
+        _ => queue.iter().position(|unit| unit.permits == 1 && fits(unit))?,
+    };
+    queue.remove(next)
 }
 
 /// Plays them; whether all passed. Tests are added to `count`.
@@ -152,11 +160,13 @@ fn all(
     one: impl Fn(&Unit, usize) -> Result<(bool, Count)> + Sync,
 ) -> Vec<Played> {
     let (mut free, mut slots, mut played) = (permits, (0..permits).collect::<Vec<_>>(), Vec::new());
+    let mut small = 0;
     let (ended, ends) = sync_channel::<Played>(permits);
     std::thread::scope(|scope| {
         loop {
-            while let Some(unit) = granted(&mut queue, free) {
+            while let Some(unit) = granted(&mut queue, free, small > 0) {
                 free -= unit.permits;
+                small += usize::from(unit.permits == 1);
                 // Each takes a permit at least.
                 let slot = slots.pop().unwrap_or_default();
                 let (ended, one) = (ended.clone(), &one);
@@ -171,6 +181,7 @@ fn all(
             }
             let Ok(one) = ends.recv() else { return };
             free += one.permits;
+            small -= usize::from(one.permits == 1);
             slots.push(one.slot);
             let word = if one.passed() { "ok" } else { "FAILED" };
             run::print(&format!("test {} ... {word} {:.1} s", one.name, one.took.as_secs_f64()));
@@ -352,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn never_more_run_at_once_than_have_permits_and_nobody_overtakes() {
+    fn never_more_run_at_once_than_have_permits() {
         let tests =
             ["partition::a", "split::a", "split_held::a", "split_restored::a", "two_of_each::a", "x::a", "y::a"];
         // Permits and slots of those that run at each moment at which one is started.
@@ -376,6 +387,19 @@ mod tests {
         assert_eq!(shares, [12_000..18_666, 18_666..25_332, 25_332..31_998], "none has a port of another");
         let one_core = queue(&["split::a"], &[], 2);
         assert_eq!(one_core[0].permits, 2, "it takes what there is");
+    }
+
+    #[test]
+    fn one_small_test_runs_beside_heavy_ones_that_leave_it_room() {
+        let mut order = queue(&["split::a", "split::b", "x::a", "y::a"], &[], 4);
+        let mut next = |free, is_passed| granted(&mut order, free, is_passed).map(|unit| unit.name);
+        let mut is = |free, is_passed, name: Option<&str>| assert_eq!(next(free, is_passed).as_deref(), name);
+        is(4, false, Some("split::a"));
+        is(1, false, Some("x::a"));
+        is(0, true, None);
+        is(1, false, Some("y::a"));
+        is(3, true, Some("split::b"));
+        is(4, false, None);
     }
 
     #[test]
