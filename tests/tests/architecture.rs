@@ -39,6 +39,7 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/ota/src/rollouts/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/stop/src/line.rs", "one task a robot's line: it must outlive the handler that opened it"),
     ("services/stop/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
+    ("services/stop/src/threads.rs", "files of the stop service are read and written beside the threads that answer"),
     ("services/midshift/src/dev/scenario.rs", "the binary makes releases for a story"),
     ("services/midshift/src/dev/scenario/watch.rs", "the binary looks at robots while a story is played"),
     ("services/midshift/src/backup/files.rs", "files are copied and read beside the runtime's threads"),
