@@ -36,6 +36,7 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/task/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/identity/src/audit/grpc.rs", "one task an export or verification, ended by its reader or by shutdown"),
     ("services/identity/src/revocation_list.rs", "lines are appended beside the runtime's threads"),
+    ("services/ota/src/threads.rs", "files are read and written beside the runtime's threads"),
     ("services/ota/src/rollouts/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/stop/src/line.rs", "one task a robot's line: it must outlive the handler that opened it"),
     ("services/stop/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
@@ -94,7 +95,7 @@ const NAMES_KEPT: &[(&str, &str)] = &[
 const LINES_MAX: usize = 600;
 
 /// Files that are still longer, below a folder, with how many of them there are. It only shrinks.
-const KNOWN_LONG: &[(&str, usize)] = &[("core/", 1), ("proto/", 2), ("services/ota/", 2), ("tests/", 3)];
+const KNOWN_LONG: &[(&str, usize)] = &[("core/", 1), ("proto/", 2), ("tests/", 3)];
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")

@@ -12,7 +12,6 @@ const KNOWN_BARE: &[(&str, usize)] = &[
     ("proto/src", 3),
     ("services/store/src", 7),
     ("services/fleet/src", 3),
-    ("services/ota/src", 9),
     ("services/identity/src", 2),
     ("ota_bundles/src", 3),
     ("tests/src", 5),
