@@ -12,7 +12,7 @@ type Said = (DataClass, Purpose, Retention);
 
 /// Fields of type `bytes`, each with the bytes of it that are taken or sent at most, and where that is enforced.
 const BYTES: &[(&str, usize, &str)] = &[
-    ("midshift.ota.v1.FetchChunksResponse.data", limits::CHUNK_BYTES, "services/ota/src/hatch.rs"),
+    ("midshift.ota.v1.FetchChunksResponse.data", limits::CHUNK_BYTES, "services/ota/src/downloads.rs"),
     ("midshift.ota.v1.GetMetadataResponse.document", limits::SIGNED_DOCUMENT_BYTES, "ota_bundles/src/trust.rs"),
     ("midshift.ota.v1.PublishRepositoryRequest.roots", limits::SIGNED_DOCUMENT_BYTES, "ota_bundles/src/trust.rs"),
     ("midshift.ota.v1.PublishRepositoryRequest.targets", limits::SIGNED_DOCUMENT_BYTES, "ota_bundles/src/trust.rs"),

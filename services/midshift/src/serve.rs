@@ -435,7 +435,7 @@ async fn start_stop(
 /// Starts the stop service beside this process again whenever it is gone. Waits for ever where there is none.
 async fn keep_stop(beside: Option<StopBeside>, store: &dyn Store) {
     match beside {
-        Some((program, child)) => program.keep(child, store).await,
+        Some((program, child)) => program.keep_running(child, store).await,
         None => std::future::pending().await,
     }
 }

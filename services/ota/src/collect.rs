@@ -4,10 +4,10 @@
 //! consists of, or that was not unnamed all through [`Room::unnamed_ms`] of serving time; nothing is published while files are taken
 //! away. There is no record of files beside the files: a cut leaves some of them, and the next pass goes on.
 
-use crate::content::{Content, Room};
+use crate::content::{self, Content, Room};
 use crate::disk::write_whole;
 use crate::repository::{Error, Repository};
-use crate::{blocking, content};
+use crate::threads::blocking;
 use midshift_bundle::digest::Digest;
 use midshift_core::ids::BundleId;
 use midshift_core::time::Utc;
@@ -164,7 +164,7 @@ impl Collector {
 
 impl Collected {
     /// Says it to whoever watches the server.
-    pub fn tell(&self, at: Utc) {
+    pub fn report_pass(&self, at: Utc) {
         metrics::counter!("midshift_ota_collected_total", "what" => "file").increment(self.files);
         metrics::counter!("midshift_ota_collected_bytes_total", "what" => "file").increment(self.file_bytes);
         metrics::gauge!("midshift_ota_unnamed_bytes").set(self.unnamed_bytes as f64);

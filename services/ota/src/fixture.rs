@@ -156,7 +156,7 @@ impl Room {
     }
     async fn open(dir: TempDir) -> Self {
         let keys = OnlineKeys::read(&dir.path().join("keys")).expect("keys");
-        let content = DiskContent::open(&dir.path().join("content"), Space::of(1 << 30)).expect("a store");
+        let content = DiskContent::open(&dir.path().join("content"), Space::with_quota(1 << 30)).expect("a store");
         let content = Arc::new(content);
         let repository = Repository::open(&dir.path().join("metadata"), keys, content.clone()).await;
         Self { content, repository: Arc::new(repository.expect("a repository")), dir }
@@ -213,7 +213,8 @@ pub async fn service(dir: &TempDir) -> OtaService {
         write_keys(&keys);
     }
     let clock = Arc::new(ScaledClock::new(|| 0, START, 1000));
-    let parts = Parts { folder: dir.path().join("ota"), keys, room: Space::of(1 << 30), clock, owner: Owner::Nobody };
+    let parts =
+        Parts { folder: dir.path().join("ota"), keys, room: Space::with_quota(1 << 30), clock, owner: Owner::Nobody };
     OtaService::open(parts).await.expect("a service")
 }
 

@@ -4,8 +4,8 @@
 //! process that holds it, however that ends; nobody waits for one without end. Called by the service when it opens, and by whoever restores
 //! a folder.
 
-use crate::blocking;
 use crate::disk::{Error as Disk, at, sync_folder, write_whole};
+use crate::threads::blocking;
 use midshift_core::limits;
 use midshift_store::StoreId;
 use rustix::fs::{FlockOperation, flock};
@@ -163,7 +163,7 @@ fn is_empty(folder: &Path) -> Result<bool, Disk> {
 }
 
 /// Refuses a folder of another store, and makes one that says nothing this store's if it may be. Nobody else is at it. Blocks.
-fn take(folder: &Path, owner: &Owner) -> Result<(), Error> {
+fn settle_owner(folder: &Path, owner: &Owner) -> Result<(), Error> {
     match owner {
         Owner::Nobody => Ok(()),
         Owner::Alone(store_id) => {
@@ -242,8 +242,8 @@ impl Presence {
             return Err(Error::InUse { folder: folder.to_owned() });
         };
         let inside = folder.to_owned();
-        blocking(move || take(&inside, &of)).await?;
-        let turn = Gate::new(Some(folder.join(CONTENT))).take().await?;
+        blocking(move || settle_owner(&inside, &of)).await?;
+        let turn = Gate::new(Some(folder.join(CONTENT))).take_turn().await?;
         let inside = path.clone();
         let number = blocking(move || {
             let _turn = turn;
@@ -326,7 +326,7 @@ impl Gate {
     ///
     /// # Errors
     /// If another process does not end its turn, or the lock cannot be had.
-    pub async fn take(&self) -> Result<Turn, Disk> {
+    pub async fn take_turn(&self) -> Result<Turn, Disk> {
         let here = self.here.clone().lock_owned().await;
         let Some(path) = self.path.clone() else { return Ok(Turn { _file: None, _here: here }) };
         let opened = path.clone();

@@ -1,8 +1,10 @@
-//! The gRPC face of releases: decode, call, encode. That of bytes is at the hatch.
+//! The gRPC face of releases: decode, call, encode. That of bytes is in `downloads`.
 
 use crate::content::{Held, Wanted};
+use crate::pages;
+use crate::refusal::{self, answer, status};
 use crate::repository::Act;
-use crate::{OtaService, pages, refusal};
+use crate::service::OtaService;
 use bytes::Bytes;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
@@ -14,15 +16,6 @@ use midshift_proto::convert::shown;
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::bundle_service_server::BundleService as BundleFace;
 use tonic::{Request, Response, Status, Streaming};
-
-pub(crate) fn status(refusal: &Refusal) -> Status {
-    metrics::counter!("midshift_ota_refused_total", "code" => refusal.reason.code.as_str()).increment(1);
-    midshift_proto::status(refusal, None)
-}
-
-pub(crate) fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
-    result.map(Response::new).map_err(|refusal| status(&refusal))
-}
 
 /// Which file a request means, and everything that is wrong with that.
 fn wanted(digest: &str, length: u64) -> Result<Wanted, Refusal> {
@@ -129,7 +122,7 @@ impl BundleFace for OtaService {
         &self,
         r: Request<v1::GetMetadataRequest>,
     ) -> Result<Response<v1::GetMetadataResponse>, Status> {
-        answer(self.hatch().metadata(r.into_inner()).await)
+        answer(self.downloads().metadata(r.into_inner()).await)
     }
     async fn list_bundles(
         &self,

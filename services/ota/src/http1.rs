@@ -2,7 +2,7 @@
 //!
 //! Invariant: the same documents and files as over gRPC, and no other; nothing is changed over HTTP.
 
-use crate::hatch::Hatch;
+use crate::downloads::Downloads;
 use axum::Router;
 use axum::body::Body;
 use axum::extract::{Path, State};
@@ -21,8 +21,8 @@ use tokio_util::io::ReaderStream;
 const FOR_EVER: &str = "public, max-age=31536000, immutable";
 
 /// The two kinds of pages.
-pub fn router(hatch: Hatch) -> Router {
-    Router::new().route("/metadata/{name}", get(metadata)).route("/targets/{name}", get(target)).with_state(hatch)
+pub fn router(downloads: Downloads) -> Router {
+    Router::new().route("/metadata/{name}", get(metadata)).route("/targets/{name}", get(target)).with_state(downloads)
 }
 
 fn refused(refusal: &Refusal) -> Response {
@@ -36,8 +36,8 @@ fn refused(refusal: &Refusal) -> Response {
     (code, format!("{refusal}\n")).into_response()
 }
 
-async fn metadata(State(hatch): State<Hatch>, Path(name): Path<String>) -> Response {
-    let found = match hatch.shown() {
+async fn metadata(State(downloads): State<Downloads>, Path(name): Path<String>) -> Response {
+    let found = match downloads.shown() {
         Ok(shown) => shown.documents.document(&name).await.map_err(Refusal::from),
         Err(refusal) => Err(refusal),
     };
@@ -52,16 +52,16 @@ async fn metadata(State(hatch): State<Hatch>, Path(name): Path<String>) -> Respo
 }
 
 async fn target(
-    State(hatch): State<Hatch>,
+    State(downloads): State<Downloads>,
     Path(name): Path<String>,
     extensions: Extensions,
     headers: HeaderMap,
 ) -> Response {
     let by = extensions.get::<Caller>().cloned().unwrap_or_else(Caller::nobody);
-    if let Err(refusal) = hatch.must_be_enrolled(&by).await {
+    if let Err(refusal) = downloads.must_be_enrolled(&by).await {
         return refused(&refusal);
     }
-    match send(&hatch, &name, &headers).await {
+    match send(&downloads, &name, &headers).await {
         Ok(Some(response)) => response,
         Ok(None) => (StatusCode::NOT_FOUND, "no such file\n").into_response(),
         Err(refusal) => refused(&refusal),
@@ -69,11 +69,11 @@ async fn target(
 }
 
 /// A signed file, or a range of it; none: no release lists it under this digest and name.
-async fn send(hatch: &Hatch, name: &str, headers: &HeaderMap) -> Result<Option<Response>, Refusal> {
-    let shown = hatch.shown()?;
+async fn send(downloads: &Downloads, name: &str, headers: &HeaderMap) -> Result<Option<Response>, Refusal> {
+    let shown = downloads.shown()?;
     let Some((digest, name)) = name.split_once('.') else { return Ok(None) };
     let Ok(digest) = digest.parse::<Digest>() else { return Ok(None) };
-    if let Err(refusal) = hatch.listed(digest).await {
+    if let Err(refusal) = downloads.listed(digest).await {
         return if refusal.kind() == Kind::NotFound { Ok(None) } else { Err(refusal) };
     }
     let newest = shown.documents.newest();

@@ -1,6 +1,6 @@
 //! Hashes signed files before their bytes are handed out: the first time since the start, and again after a day.
 //!
-//! Called by the hatch. Invariant: a file whose bytes are not what its name says is handed out by nobody; where this process keeps the folder
+//! Called by `downloads`. Invariant: a file whose bytes are not what its name says is handed out by nobody; where this process keeps the folder
 //! it is taken away, so that it can be pushed again.
 
 use crate::content::{Content, Error};

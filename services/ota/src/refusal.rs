@@ -7,6 +7,7 @@ use crate::repository;
 use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use std::io::ErrorKind;
+use tonic::{Response, Status};
 
 /// Missing files that are named in a refusal; the rest are counted.
 const NAMED_MAX: usize = 16;
@@ -84,4 +85,15 @@ impl From<repository::Error> for Refusal {
 pub fn too_large(length: u64) -> Refusal {
     let text = format!("{length} bytes are more than {COMPONENT_BYTES_MAX}");
     Refusal::new(Kind::Exhausted, Reason::new(Code::UploadTooLarge, text))
+}
+
+/// A refusal as gRPC tells it; it is counted.
+pub fn status(refusal: &Refusal) -> Status {
+    metrics::counter!("midshift_ota_refused_total", "code" => refusal.reason.code.as_str()).increment(1);
+    midshift_proto::status(refusal, None)
+}
+
+/// An answer over gRPC, or why there is none.
+pub fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
+    result.map(Response::new).map_err(|refusal| status(&refusal))
 }

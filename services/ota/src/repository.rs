@@ -5,32 +5,36 @@
 
 mod check;
 mod documents;
+mod error;
+mod files;
 mod keyless;
+mod newest;
 mod online;
 
 pub use documents::Documents;
+pub(crate) use documents::every_second;
+pub use error::Error;
+pub use files::raise_floor;
 pub use keyless::{Keyless, SetLost};
+pub use newest::{By, Kept, Newest, Release};
 pub use online::OnlineKeys;
 
-use crate::blocking;
-use crate::content::{self, Content};
+use crate::content::Content;
 use crate::disk::write_whole;
-use crate::folder::{self, Gate, Turn};
+use crate::folder::{Gate, Turn};
+use crate::threads::blocking;
+use error::io;
+use files::{BY, SEEN, TIMESTAMP, file, read, read_by, read_floor, read_seen};
 use midshift_bundle::digest::Digest;
-use midshift_bundle::freshness::{Edition, Stamp, newest_targets, root_edition, stamp};
-use midshift_bundle::key_set::KeySet;
-use midshift_bundle::keys::{self, SecretKey};
+use midshift_bundle::freshness::{Stamp, newest_targets, root_edition, stamp};
+use midshift_bundle::keys::SecretKey;
 use midshift_bundle::manifest::Manifest;
-use midshift_bundle::repository::{self as people, FileTarget, Online, TIMESTAMP_LIFE_MS, listed};
-use midshift_bundle::ways::Way;
+use midshift_bundle::repository::{FileTarget, Online, TIMESTAMP_LIFE_MS, listed};
 use midshift_core::Boxed;
-use midshift_core::identity::{Actor, TokenId};
-use midshift_core::reason::Refusal;
+use midshift_core::identity::Actor;
 use midshift_core::time::{Clock, Doubt, Utc};
-use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -38,100 +42,6 @@ use std::sync::{Arc, Mutex, PoisonError};
 pub const FRESHEN_AFTER_MS: u64 = TIMESTAMP_LIFE_MS / 2;
 /// Snapshots kept for clients that read an older timestamp a moment ago.
 const SNAPSHOTS_KEPT: usize = 16;
-/// What names the newest of everything.
-const TIMESTAMP: &str = "timestamp.json";
-/// When each bundle was seen first, by its digest. Not shown.
-const SEEN: &str = "seen.json";
-/// Who published what, for the audit.
-const BY: &str = "by.json";
-/// Lowest version of what is signed here from now on, as a number. Only a restored repository has it. Not shown.
-const FLOOR: &str = "floor.json";
-
-/// Why the repository stays as it was.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The disk.
-    #[error(transparent)]
-    Disk(#[from] content::Error),
-    /// A key file.
-    #[error(transparent)]
-    Key(#[from] keys::Error),
-    /// A document of this server.
-    #[error(transparent)]
-    Document(#[from] people::Error),
-    /// The folder has no key of a role.
-    #[error("{folder} has no {role}-*.pem")]
-    NoKeyFile {
-        /// Where they should be.
-        folder: PathBuf,
-        /// The role whose keys are missing.
-        role: &'static str,
-    },
-    /// None of the server's keys may sign.
-    #[error(
-        "the repository's root {root_version} names other {role} keys than this server has: it is another project's repository, or its new keys are not in the server's folder of keys"
-    )]
-    NotNamed {
-        /// The root.
-        root_version: u64,
-        /// The role that has other keys there.
-        role: &'static str,
-    },
-    /// The folder is not this store's, or not there.
-    #[error(transparent)]
-    Folder(#[from] folder::Error),
-    /// What is offered breaks rules.
-    #[error("{0}")]
-    Refused(#[from] Refusal),
-    /// Somebody else published.
-    #[error("the newest targets document is {newest}, not {expected}")]
-    Moved {
-        /// Version that is the newest; 0: none.
-        newest: u64,
-        /// Version that was expected.
-        expected: u64,
-    },
-    /// Files are listed that are not here.
-    #[error("{} listed files are not here, the first is {}", .0.len(), .0.first().map_or("", |f| f.name.as_str()))]
-    Missing(Vec<FileTarget>),
-    /// The wall is in doubt, and everything that is signed has its time.
-    #[error("nothing is signed by a clock that is {step_ms} ms off", step_ms = .0.step_ms)]
-    Clock(Doubt),
-    /// What lies on the disk does not hang together.
-    #[error("{folder}: {text}")]
-    Damaged {
-        /// The documents.
-        folder: PathBuf,
-        /// What does not hold.
-        text: String,
-    },
-}
-
-fn io(doing: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
-    let path = path.to_owned();
-    move |source| content::Error::Io { doing, path, source }.into()
-}
-
-/// A document with its number and end.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Kept {
-    /// As it was signed.
-    pub bytes: Vec<u8>,
-    /// Its number and end.
-    pub edition: Edition,
-}
-
-/// A bundle of the newest targets document.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Release {
-    /// Of its manifest.
-    pub digest: Digest,
-    /// What it holds.
-    pub manifest: Manifest,
-    /// When the server saw it first.
-    pub seen: Utc,
-}
-
 /// Who publishes, and when.
 #[derive(Clone, Debug)]
 pub struct Act {
@@ -146,95 +56,6 @@ impl Act {
     /// Of whoever makes releases in tests.
     pub fn of_release(at: Utc) -> Self {
         Self { by: "release".into(), at }
-    }
-}
-
-/// Who published what: nothing that robots see. Of a publication by an older release nobody is known.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct By {
-    /// The newest targets document.
-    newest: Option<String>,
-    /// The token that was shown for it.
-    newest_token: Option<TokenId>,
-    /// Each bundle of it, since it was listed.
-    bundles: BTreeMap<Digest, String>,
-    /// The token that was shown for each of them.
-    tokens: BTreeMap<Digest, TokenId>,
-}
-
-impl By {
-    /// After a publication of these.
-    fn after(mut self, by: &Actor, releases: &[Release]) -> Self {
-        let is_listed = |digest: &Digest| releases.iter().any(|release| release.digest == *digest);
-        self.bundles.retain(|digest, _| is_listed(digest));
-        self.tokens.retain(|digest, _| is_listed(digest));
-        for release in releases.iter().filter(|release| !self.bundles.contains_key(&release.digest)) {
-            self.tokens.extend(by.token().map(|token| (release.digest, token.clone())));
-        }
-        for release in releases {
-            self.bundles.entry(release.digest).or_insert_with(|| by.to_string());
-        }
-        Self { newest: Some(by.to_string()), newest_token: by.token().cloned(), ..self }
-    }
-    /// Who published the newest document.
-    pub fn newest(&self) -> Option<Actor> {
-        self.newest.as_ref().map(|name| Actor::new(name, self.newest_token.clone()))
-    }
-    /// Who listed this bundle.
-    pub fn bundle(&self, digest: &Digest) -> Option<Actor> {
-        self.bundles.get(digest).map(|name| Actor::new(name, self.tokens.get(digest).cloned()))
-    }
-}
-
-/// What the repository says now.
-#[derive(Clone, Debug)]
-pub struct Newest {
-    /// Who may sign.
-    pub root: Kept,
-    /// Which files there are.
-    pub targets: Kept,
-    /// How fresh that is.
-    pub stamp: Stamp,
-    /// Files that may be handed out, by name.
-    pub files: BTreeMap<String, FileTarget>,
-    /// Bundles by name and version.
-    pub releases: Vec<Release>,
-    /// Who published them.
-    pub by: By,
-    /// The newest set of keys that sign directives; none: robots have them from their trust files alone, or it is listed and cannot be read.
-    pub key_set: Option<KeySet>,
-    /// Manifests that are listed and that the disk did not give, though they are there, and the newest set of directive keys if it could not be
-    /// read for whatever reason. They are tried again each second; nobody may conclude from it that they are gone.
-    pub unread: BTreeSet<Digest>,
-    /// The newest set of directive keys is gone or damaged, and what it was is not known.
-    pub set_lost: Option<SetLost>,
-    digests: BTreeSet<Digest>,
-    timestamp: Vec<u8>,
-}
-
-impl Newest {
-    /// Every file of the newest targets document.
-    pub const fn digests(&self) -> &BTreeSet<Digest> {
-        &self.digests
-    }
-    /// Whether sets of directive keys are listed, readable or not.
-    fn lists_sets(&self) -> bool {
-        self.files.keys().any(|name| KeySet::number_of(name).is_some())
-    }
-    /// The shortest listed way to a file for a robot that has `bases`, the best first, and the one of them that it leads from.
-    pub fn way(&self, to: Digest, bases: &[Digest]) -> Option<(Option<Digest>, &FileTarget)> {
-        let mut ways = bases.iter().copied().map(Some).chain([None]);
-        ways.find_map(|from| Some((from, self.files.get(&Way { to, from }.target())?)))
-    }
-    /// Bytes of all listed ways that are shorter than the files they lead to.
-    pub fn way_bytes(&self) -> u64 {
-        let ways = self.files.iter().filter(|(name, _)| Way::of_target(name).is_some());
-        ways.map(|(_, file)| file.length).sum()
-    }
-    /// Whether a signed release has this file.
-    pub fn lists(&self, digest: Digest) -> bool {
-        self.digests.contains(&digest)
     }
 }
 
@@ -312,7 +133,7 @@ impl Repository {
 
     /// That nobody else publishes or signs, here or elsewhere, and what is the newest then.
     async fn turn(&self) -> Result<(Turn, Option<Arc<Newest>>), Error> {
-        let turn = self.writing.take().await?;
+        let turn = self.writing.take_turn().await?;
         self.documents.follow().await?;
         Ok((turn, self.newest()))
     }
@@ -534,7 +355,7 @@ impl Repository {
         writes.push((file(targets.edition.version, "targets"), targets.bytes.clone()));
         writes.push((file(stamp.snapshot_version, "snapshot"), online.snapshot));
         writes.push((TIMESTAMP.to_owned(), online.timestamp.clone()));
-        let newest = Newest { key_set, by, ..Newest::of(root, targets, stamp, files, releases, online.timestamp) };
+        let newest = Newest { key_set, by, ..Newest::new(root, targets, stamp, files, releases, online.timestamp) };
         Ok(Publication { writes, newest })
     }
 
@@ -599,33 +420,6 @@ impl Repository {
     }
 }
 
-impl Newest {
-    fn of(
-        root: Kept,
-        targets: Kept,
-        stamp: Stamp,
-        files: Vec<FileTarget>,
-        releases: Vec<Release>,
-        timestamp: Vec<u8>,
-    ) -> Self {
-        let digests = files.iter().map(|file| file.digest).collect();
-        let files = files.into_iter().map(|file| (file.name.clone(), file)).collect();
-        Self {
-            root,
-            targets,
-            stamp,
-            files,
-            releases,
-            by: By::default(),
-            key_set: None,
-            unread: BTreeSet::new(),
-            set_lost: None,
-            digests,
-            timestamp,
-        }
-    }
-}
-
 fn files_of(bundle: Digest, manifest: &Manifest) -> Vec<Digest> {
     std::iter::once(bundle).chain(manifest.components.iter().map(|component| component.digest)).collect()
 }
@@ -648,45 +442,6 @@ fn prune(folder: &Path) -> Result<(), Error> {
     let gone = snapshots.iter().take(stale).map(|number| file(*number, "snapshot"));
     let gone = gone.chain(targets.range(..named).map(|number| file(*number, "targets")));
     gone.map(|name| folder.join(name)).try_for_each(|path| fs::remove_file(&path).map_err(io("removing", &path)))
-}
-
-/// Makes what is signed in `folder` from now on have at least this version: robots have seen versions that a restored repository does not
-/// know of, and take nothing older. A version below that of an earlier call changes nothing. Nobody may serve from it.
-///
-/// # Errors
-/// If what an earlier call said cannot be read, or it cannot be written.
-pub fn raise_floor(folder: &Path, version: u64) -> Result<(), Error> {
-    let version = version.max(read_floor(folder)?);
-    Ok(write_whole(&folder.join(FLOOR), version.to_string().as_bytes())?)
-}
-
-fn read_floor(folder: &Path) -> Result<u64, Error> {
-    let bytes = read(&folder.join(FLOOR))?.unwrap_or_else(|| b"1".to_vec());
-    serde_json::from_slice(&bytes)
-        .map_err(|e| Error::Damaged { folder: folder.to_owned(), text: format!("{FLOOR}: {e}") })
-}
-
-fn read_seen(folder: &Path) -> Result<BTreeMap<Digest, Utc>, Error> {
-    let bytes = read(&folder.join(SEEN))?.unwrap_or_else(|| b"{}".to_vec());
-    serde_json::from_slice(&bytes)
-        .map_err(|e| Error::Damaged { folder: folder.to_owned(), text: format!("{SEEN}: {e}") })
-}
-
-fn read_by(folder: &Path) -> Result<By, Error> {
-    let bytes = read(&folder.join(BY))?.unwrap_or_else(|| b"{}".to_vec());
-    serde_json::from_slice(&bytes).map_err(|e| Error::Damaged { folder: folder.to_owned(), text: format!("{BY}: {e}") })
-}
-
-fn file(version: u64, role: &str) -> String {
-    format!("{version}.{role}.json")
-}
-
-fn read(path: &Path) -> Result<Option<Vec<u8>>, Error> {
-    match fs::read(path) {
-        Ok(bytes) => Ok(Some(bytes)),
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-        Err(error) => Err(io("reading", path)(error)),
-    }
 }
 
 #[cfg(test)]

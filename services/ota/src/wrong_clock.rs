@@ -3,8 +3,9 @@
 use crate::content::Room;
 use crate::fixture::{SEEDS, START, files, release, robot, targets, write_keys};
 use crate::folder::Owner;
+use crate::opened::Opened;
 use crate::repository::{Act, Error, FRESHEN_AFTER_MS, Keyless};
-use crate::{Opened, OtaService, Parts};
+use crate::{OtaService, Parts};
 use midshift_bundle::trust::{self, Reading, Source, Trusted};
 use midshift_core::time::{Clock, Utc};
 use midshift_core::wall::WallClock;
@@ -33,7 +34,7 @@ impl Site {
         let wall = move || Utc(ahead.load(Relaxed)).plus_ms(beside.load(Relaxed) / 1000);
         let clock: Arc<dyn Clock> = Arc::new(WallClock::new(move || mono.load(Relaxed), wall, |_| {}));
         let folder = dir.path().join("ota");
-        let parts = Parts { folder, keys, room: Room::of(1 << 30), clock, owner: Owner::Nobody };
+        let parts = Parts { folder, keys, room: Room::with_quota(1 << 30), clock, owner: Owner::Nobody };
         let service = OtaService::open(parts).await.expect("a service");
         Self { us, ahead_ms, service, _dir: dir }
     }
@@ -43,12 +44,12 @@ impl Site {
     /// Time passes, and the server looks.
     async fn pass(&self, ms: u64) {
         self.us.fetch_add(ms * 1000, Relaxed);
-        self.opened().look().await;
+        self.opened().freshen_documents().await;
     }
     /// Somebody sets the wall.
     async fn set(&self, ms: i64) {
         self.ahead_ms.fetch_add(ms, Relaxed);
-        self.opened().look().await;
+        self.opened().freshen_documents().await;
     }
     fn version(&self) -> u64 {
         self.opened().repository.newest().expect("published").stamp.version

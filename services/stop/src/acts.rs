@@ -4,9 +4,11 @@
 //! was written and recorded, or says that it was not.
 
 use crate::audit::{Action, MIDSHIFT, Note};
+use crate::frames;
+use crate::inner::Inner;
 use crate::law::{Asked, Law, Resetting};
 use crate::outbox::Frame;
-use crate::{Inner, frames, lock};
+use crate::threads::lock;
 use midshift_core::identity::{Actor, Caller, Permission};
 use midshift_core::ids::{RequestId, RobotId, StopId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
@@ -76,7 +78,7 @@ pub fn engage(inner: &Inner, wanted: Wanted) -> Result<Engaged, Refusal> {
     let note = note(Action::Engaged, &stop, now.wall);
     inner.disk.note(request_id.iter().fold(note, |note, id| note.with("request_id", id)));
     drop(law);
-    let told = generation.map_or(0, |generation| tell(inner, &stop, generation, &now));
+    let told = generation.map_or(0, |generation| tell_lines(inner, &stop, generation, &now));
     drop(fan);
     inner.disk.wake();
     inner.touch();
@@ -160,7 +162,7 @@ fn take_back(inner: &Inner, stops: Vec<Stop>, from: (&str, &str)) -> Vec<StopId>
         let engaged = note(Action::Adopted, &stop, now.wall).with("engaged_by", &stop.actor);
         inner.disk.note(Note { actor: MIDSHIFT.to_owned(), ..engaged.with(from.0, from.1) });
         drop(law);
-        tell(inner, &stop, generation, &now);
+        tell_lines(inner, &stop, generation, &now);
         adopted += 1;
         metrics::counter!("midshift_stop_adopted_total").increment(1);
         tracing::warn!(stop_id = %stop.stop_id, from = from.1, "a lost stop was taken back");
@@ -183,7 +185,7 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Res
     let mut law = lock(&inner.law);
     let areas = law.latch().stop(&stop_id).map(|stop| inner.ground.areas(&stop.scope)).unwrap_or_default();
     if let Err(refusal) = by.needs(Permission::Reset, &areas) {
-        let note = Note::of(now.wall, Action::Denied, &by.into());
+        let note = Note::by_actor(now.wall, Action::Denied, &by.into());
         let note = note.with("code", refusal.reason.code).with("asked", "stop.reset").with("stop_id", stop_id);
         inner.disk.denied(note, 0);
         return Err(refusal);
@@ -195,7 +197,7 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Res
     let resetting = law.reset(reset);
     if resetting.is_new {
         let Reset { stop_id, reason, .. } = &resetting.reset;
-        let note = Note::of(now.wall, Action::Reset, &by);
+        let note = Note::by_actor(now.wall, Action::Reset, &by);
         inner
             .disk
             .note(note.with("stop_id", stop_id).with("reason", reason).with("was_engaged", resetting.was_engaged));
@@ -216,7 +218,7 @@ pub fn settle(inner: &Inner, version: u64) {
     for (reset, generation) in settled {
         for bytes in frames::told([], [&reset], generation) {
             let resets = [reset.stop_id.clone()].into();
-            inner.robots.tell(&Frame { generation, bytes, resets }, now.link);
+            inner.robots.tell_lines(&Frame { generation, bytes, resets }, now.link);
         }
         metrics::counter!("midshift_stop_reset_total").increment(1);
         tracing::warn!(stop_id = %reset.stop_id, "stop reset");
@@ -225,14 +227,14 @@ pub fn settle(inner: &Inner, version: u64) {
     inner.touch();
 }
 
-fn tell(inner: &Inner, stop: &Stop, generation: u64, now: &Now) -> usize {
+fn tell_lines(inner: &Inner, stop: &Stop, generation: u64, now: &Now) -> usize {
     let told = frames::told([stop], [], generation).into_iter();
-    told.map(|bytes| inner.robots.tell(&Frame { generation, bytes, resets: [].into() }, now.link)).sum()
+    told.map(|bytes| inner.robots.tell_lines(&Frame { generation, bytes, resets: [].into() }, now.link)).sum()
 }
 
 fn note(action: Action, stop: &Stop, at: Utc) -> Note {
     let Stop { stop_id, scope, level, reason, .. } = stop;
-    let note = Note::of(at, action, &Actor::new(&stop.actor, stop.token_id.clone()));
+    let note = Note::by_actor(at, action, &Actor::new(&stop.actor, stop.token_id.clone()));
     note.with("stop_id", stop_id).with("scope", scope).with("level", format!("{level:?}")).with("reason", reason)
 }
 

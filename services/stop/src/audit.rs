@@ -69,7 +69,7 @@ impl Note {
         Self { at, actor: MIDSHIFT.to_owned(), action, fields: BTreeMap::new() }
     }
     /// Of somebody, with the token that was shown.
-    pub fn of(at: Utc, action: Action, by: &Actor) -> Self {
+    pub fn by_actor(at: Utc, action: Action, by: &Actor) -> Self {
         let note = Self { actor: by.to_string(), ..Self::own(at, action) };
         by.token().iter().fold(note, |note, token| note.with(TOKEN, token))
     }

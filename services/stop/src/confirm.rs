@@ -3,7 +3,8 @@
 //! Invariant: what is told of a robot is what [`confirmation`] makes of its own newest word; nothing is confirmed by time. Leaving early takes nothing back.
 
 use crate::acts::was_reset;
-use crate::{Inner, Times, lock};
+use crate::inner::Inner;
+use crate::threads::lock;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::nearest::nearest;
@@ -11,7 +12,7 @@ use midshift_core::reason::Refusal;
 use midshift_core::robot::StopLevel;
 use midshift_core::stop::roster::{Confirmation, confirmation, is_elsewhere};
 use midshift_core::stop::{Scope, Stop};
-use midshift_core::time::Now;
+use midshift_core::time::{LinkTime, Now, Utc};
 use midshift_proto::convert::WireEnum;
 use midshift_proto::stop::v1;
 use std::collections::BTreeMap;
@@ -21,6 +22,11 @@ use tonic::Status;
 
 /// Silence becomes visible at most this late.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
+
+/// UTC of the wall at a moment of the link clock before or after now, as people read it.
+pub fn wall_at(now: &Now, at: LinkTime) -> Utc {
+    Utc(now.wall.0 + at.0.cast_signed() - now.link.0.cast_signed())
+}
 
 /// Adds one robot.
 pub fn count(counts: &mut v1::Counts, confirmation: Confirmation) {
@@ -53,8 +59,8 @@ fn encode(robot_id: &RobotId, found: &Found, now: &Now) -> v1::RobotStop {
     v1::RobotStop {
         robot_id: robot_id.to_string(),
         confirmation: word.into(),
-        unreachable_since_unix_ms: since.map_or(0, |at| now.wall_at(at).0),
-        self_stop_by_unix_ms: by.map_or(0, |at| now.wall_at(at).0),
+        unreachable_since_unix_ms: since.map_or(0, |at| wall_at(now, at).0),
+        self_stop_by_unix_ms: by.map_or(0, |at| wall_at(now, at).0),
         obeys: found.obeys.to_wire(),
         elsewhere: found.is_elsewhere,
     }
@@ -77,7 +83,7 @@ struct Watching<'a> {
 impl Watching<'_> {
     /// # Errors
     /// The stop was reset.
-    fn look(&mut self, now: &Now) -> Result<Seen, Refusal> {
+    fn look_at_robots(&mut self, now: &Now) -> Result<Seen, Refusal> {
         let stop_id = &self.stop.stop_id;
         let law = lock(&self.inner.law);
         let since = law.effective().find(|(stop, _)| stop.stop_id == *stop_id).map(|(_, since)| since);
@@ -148,7 +154,7 @@ fn may_mean(stop: &Stop, robot_id: &RobotId) -> bool {
 }
 
 /// Tells of a stop until nothing more is to come, or the reader leaves. `may_stay`: there is room for one more reader; else it is told once.
-pub async fn tell(
+pub async fn tell_of_stop(
     inner: &Inner,
     stop: Stop,
     mut durable: bool,
@@ -163,7 +169,7 @@ pub async fn tell(
     loop {
         changed.mark_unchanged();
         let now = inner.clock.now();
-        let seen = match watching.look(&now) {
+        let seen = match watching.look_at_robots(&now) {
             Ok(seen) => seen,
             Err(refusal) => {
                 let _ = sender.send(Err(midshift_proto::status(&refusal, None))).await;

@@ -1,17 +1,14 @@
-//! The one writer of the folder: the latch, then the audit, then the audit's last hash into the latch.
+//! What the rest of the service knows of its disk: what waits for it, and how far it is.
 //!
-//! Invariant: who engages or resets waits for a turn of this writer and no longer than [`limits::STOP_DURABLE_WITHIN`]; what the disk refused is tried again
-//! each second and with each change. Records that wait are bounded, and those left out are counted.
+//! Invariant: who engages or resets waits for a turn of the disk and no longer than [`limits::STOP_DURABLE_WITHIN`]. Records that wait are bounded, and those
+//! left out are counted.
 
-use crate::audit::{Action, Audit, Note, Tail};
-use crate::holder::Holder;
-use crate::law::Kept;
-use crate::{Inner, acts, blocking, lock};
+use crate::audit::{Action, Note};
+use crate::threads::lock;
 use midshift_core::limits;
 use midshift_core::time::Utc;
-use midshift_latch::{Error, LatchFile};
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex};
+use std::sync::Mutex;
 use std::time::Duration;
 use tokio::sync::{Notify, watch};
 
@@ -107,6 +104,21 @@ impl Disk {
     pub fn wake(&self) {
         self.wake.notify_one();
     }
+    /// Waits until there is.
+    pub fn woken(&self) -> impl Future<Output = ()> {
+        self.wake.notified()
+    }
+    /// It had its turn with `version`, and holds it if `is_kept`; `recorded`: it holds so many of the records that were ever queued. None: it refuses the audit.
+    pub fn end_turn(&self, version: u64, is_kept: bool, recorded: Option<u64>) {
+        self.outcome.send_modify(|outcome| {
+            outcome.tried = outcome.tried.max(version);
+            outcome.refuses_audit = recorded.is_none();
+            outcome.recorded = outcome.recorded.max(recorded.unwrap_or_default());
+            if is_kept {
+                outcome.kept = outcome.kept.max(version);
+            }
+        });
+    }
     /// Waits for the disk's turn with `version`. Whether it is durable.
     pub async fn turn(&self, version: u64) -> bool {
         let mut outcome = self.outcome.subscribe();
@@ -123,7 +135,7 @@ impl Disk {
         self.outcome.borrow().refuses_audit
     }
     /// What is to be written, and how many were ever queued with it.
-    fn take(&self, now: Utc) -> (Vec<Note>, u64) {
+    pub fn take_notes(&self, now: Utc) -> (Vec<Note>, u64) {
         let mut queue = lock(&self.queue);
         let queued = queue.queued;
         let mut notes: Vec<Note> = queue.notes.drain(..).collect();
@@ -133,7 +145,8 @@ impl Disk {
         }
         (notes, queued)
     }
-    fn put_back(&self, notes: Vec<Note>) {
+    /// What was not written is to be written still, before all else.
+    pub fn put_back(&self, notes: Vec<Note>) {
         let mut queue = lock(&self.queue);
         for note in notes.into_iter().rev() {
             match note.fields.get("records").filter(|_| note.action == Action::Dropped) {
@@ -142,135 +155,10 @@ impl Disk {
             }
         }
     }
-    fn is_empty(&self) -> bool {
+    /// No record waits.
+    pub fn is_empty(&self) -> bool {
         let queue = lock(&self.queue);
         queue.notes.is_empty() && queue.dropped == 0
-    }
-}
-
-/// The files.
-pub struct Writer {
-    /// Says which process has the folder; let go of before the latch.
-    pub _holder: Holder,
-    /// The latch.
-    pub file: LatchFile,
-    /// The audit.
-    pub audit: Audit,
-    /// The last record that the latch file knows of.
-    pub known: Tail,
-}
-
-/// What became of one turn.
-struct Turn {
-    latch: Result<(), Error>,
-    audit: Result<(), (std::io::Error, Vec<Note>)>,
-}
-
-impl Writer {
-    fn turn(&mut self, kept: Option<Kept>, notes: Vec<Note>, now: Utc) -> Turn {
-        let latch = match &kept {
-            Some(kept) => self.file.write(kept).map(|()| self.known = kept.audit.clone()),
-            None => Ok(()),
-        };
-        let audit = match notes.is_empty() {
-            true => Ok(()),
-            false => self.audit.append(&notes, now).map_err(|error| (error, notes)),
-        };
-        Turn { latch, audit }
-    }
-}
-
-/// Which files refuse.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-struct Refusing {
-    latch: bool,
-    audit: bool,
-}
-
-/// Writes until shutdown, and once more then; what was reset long ago goes at the start and each hour.
-pub async fn keep(inner: &Arc<Inner>, mut writer: Writer) {
-    let mut refusing = Refusing::default();
-    let mut forget = tokio::time::interval(Duration::from_millis(limits::RESETS_FORGOTTEN_EVERY.as_ms()));
-    loop {
-        // Whatever comes from now on wakes it again, or is refused.
-        let (is_last, version) = {
-            let _fan = lock(&inner.fan);
-            (inner.shutdown.is_cancelled(), lock(&inner.law).version())
-        };
-        let is_due = !inner.disk.holds(version);
-        let tail_is_due = writer.audit.tail() != &writer.known;
-        if is_due || tail_is_due || !inner.disk.is_empty() {
-            let before = refusing;
-            (writer, refusing) = turn(inner, writer, version, is_due || tail_is_due).await;
-            said(before, refusing);
-            if refusing == Refusing::default() && !is_last {
-                continue;
-            }
-        }
-        if is_last {
-            return;
-        }
-        let again = Duration::from_millis(limits::STOP_DISK_AGAIN.as_ms());
-        tokio::select! {
-            () = inner.disk.wake.notified() => {}
-            () = inner.shutdown.cancelled() => {}
-            _ = forget.tick() => lock(&inner.law).forget(inner.clock.now().wall),
-            () = tokio::time::sleep(again), if refusing != Refusing::default() => {}
-        }
-    }
-}
-
-async fn turn(inner: &Arc<Inner>, mut writer: Writer, version: u64, is_due: bool) -> (Writer, Refusing) {
-    let now = inner.clock.now().wall;
-    let kept = is_due.then(|| lock(&inner.law).kept(writer.audit.tail().clone()));
-    let (notes, queued) = inner.disk.take(now);
-    let (back, turn) = blocking(move || {
-        let turn = writer.turn(kept, notes, now);
-        (writer, turn)
-    })
-    .await;
-    let mut refusing = Refusing::default();
-    if let Err(error) = &turn.latch {
-        refusing.latch = true;
-        tracing::debug!(%error, "the latch was not written");
-        if matches!(error, Error::TooLarge { .. }) {
-            tracing::error!("the latch does not fit its file: the older half of its resets is forgotten");
-            lock(&inner.law).shorten(now);
-        }
-    }
-    if let Err((error, notes)) = turn.audit {
-        refusing.audit = true;
-        tracing::debug!(%error, "the audit was not written");
-        inner.disk.put_back(notes);
-    }
-    acts::settle(inner, version);
-    inner.disk.outcome.send_modify(|outcome| {
-        outcome.tried = outcome.tried.max(version);
-        outcome.refuses_audit = refusing.audit;
-        if !refusing.audit {
-            outcome.recorded = outcome.recorded.max(queued);
-        }
-        if is_due && !refusing.latch {
-            outcome.kept = outcome.kept.max(version);
-        }
-    });
-    inner.touch();
-    (back, refusing)
-}
-
-/// One line a change.
-fn said(before: Refusing, now: Refusing) {
-    metrics::gauge!("midshift_stop_latch_durable").set(f64::from(u8::from(!now.latch)));
-    metrics::gauge!("midshift_stop_audit_durable").set(f64::from(u8::from(!now.audit)));
-    for (file, before, now) in [("latch", before.latch, now.latch), ("audit", before.audit, now.audit)] {
-        match (before, now) {
-            (false, true) => tracing::error!(
-                file,
-                "the disk refuses a file of the stop service; it goes on in memory and tries again"
-            ),
-            (true, false) => tracing::warn!(file, "the disk takes a file of the stop service again"),
-            _ => {}
-        }
     }
 }
 
@@ -284,13 +172,13 @@ mod tests {
         let denied = |at_ms| disk.denied(Note::own(Utc(at_ms), Action::Denied), 0);
         let most = u64::from(limits::STOP_DENIALS_PER_MINUTE);
         (0..most + 40).for_each(|_| denied(1_000));
-        assert_eq!(disk.take(Utc(1_000)).0.len() as u64, most);
+        assert_eq!(disk.take_notes(Utc(1_000)).0.len() as u64, most);
         denied(61_000);
-        let next = disk.take(Utc(61_000)).0;
+        let next = disk.take_notes(Utc(61_000)).0;
         assert_eq!(next[0].fields.get("left_out").map(String::as_str), Some("40"));
         (0..limits::STOP_AUDIT_QUEUE / 2).for_each(|_| disk.note(Note::own(Utc(0), Action::Engaged)));
         denied(121_000);
-        let notes = disk.take(Utc(121_000)).0;
+        let notes = disk.take_notes(Utc(121_000)).0;
         assert!(notes.iter().all(|note| note.action == Action::Engaged), "none while stops wait for the disk");
     }
 }

@@ -2,9 +2,9 @@
 //!
 //! A stop goes to all robots as it was encoded once. Invariant: the wire is that of `stop_link_service.proto`; a generated client cannot tell.
 
-use crate::Inner;
+use crate::down::Down;
+use crate::inner::Inner;
 use crate::line;
-use crate::outbox::Down;
 use bytes::{BufMut, Bytes};
 use midshift_core::limits;
 use midshift_proto::access::caller;

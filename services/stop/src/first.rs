@@ -3,7 +3,7 @@
 //! Invariant: it counts only where neither latch nor key is there, and it is gone before the service listens: it opens one start and no other.
 //! Called by whoever has the store, before the stop service beside it is started; taken by the stop service as it opens its folder.
 
-use crate::LATCH;
+use crate::folder::LATCH;
 use crate::proof;
 use std::fs::DirBuilder;
 use std::io;

@@ -1,7 +1,8 @@
 //! The people's and programs' face: decode, call, encode.
 
 use crate::acts::{self, Wanted};
-use crate::{StopService, WATCH_MAX, confirm, status};
+use crate::service::StopService;
+use crate::{confirm, status};
 use midshift_core::identity::Caller;
 use midshift_core::ids::{RequestId, StopId};
 use midshift_core::limits;
@@ -18,6 +19,9 @@ use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
+
+/// Messages on their way to one watcher.
+const WATCH_MAX: usize = 4;
 
 fn wanted(r: v1::EngageRequest, by: &Caller) -> Result<Wanted, Refusal> {
     let mut bad = Violations::default();
@@ -79,7 +83,7 @@ impl StopService {
             tokio::select! {
                 // What was engaged is said, whatever follows.
                 biased;
-                () = confirm::tell(&inner, engaged.stop, durable, engaged.version, room.is_some(), sender) => {}
+                () = confirm::tell_of_stop(&inner, engaged.stop, durable, engaged.version, room.is_some(), sender) => {}
                 () = ends.cancelled() => goes_on_elsewhere(&reader).await,
             }
             drop(room);
@@ -120,7 +124,7 @@ impl StopService {
             let (ends, reader) = (inner.ended.clone(), sender.clone());
             tokio::select! {
                 () = ends.cancelled() => goes_on_elsewhere(&reader).await,
-                () = status::tell(&inner, sender) => {}
+                () = status::tell_status(&inner, sender) => {}
             }
             drop(room);
         });

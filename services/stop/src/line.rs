@@ -4,10 +4,13 @@
 //! none. A line on which nothing comes up, nothing is read or a message breaks the rules ends with a status that says so:
 //! the robot's own silence does the rest.
 
+use crate::acts;
 use crate::audit::{Action, Note};
-use crate::outbox::{Down, End, Outbox};
+use crate::down::Down;
+use crate::inner::Inner;
+use crate::outbox::{End, Outbox};
 use crate::robots::{Comes, Held, Robot, Robots};
-use crate::{Inner, acts, lock};
+use crate::threads::lock;
 use midshift_core::identity::Caller;
 use midshift_core::ids::{RobotId, StopId};
 use midshift_core::limits;
@@ -53,7 +56,7 @@ async fn begin(
 ) -> Result<(Arc<Robot>, Arc<Outbox>), Refusal> {
     let First { robot_id, boot_id, stops, more } = first(up).await?;
     by.is_robot(&robot_id)?;
-    let robot = inner.robots.of(&robot_id)?;
+    let robot = inner.robots.find_or_add(&robot_id)?;
     let listed = stops.iter().map(|stop| &stop.stop_id).chain(&more).cloned().collect();
     let foreign = acts::adopt(inner, &robot_id, stops, more);
     let outbox = Arc::new(Outbox::new(listed));
@@ -76,7 +79,7 @@ fn held_by_another(inner: &Inner, robot_id: &RobotId, by: &Caller, held: Held, n
     metrics::counter!("midshift_stop_lines_contested_total").increment(1);
     if held.is_news {
         tracing::warn!(peer = Empty, %robot_id, "another start of this robot was not let in while one is heard");
-        let note = Note::of(now.wall, Action::Denied, &by.into());
+        let note = Note::by_actor(now.wall, Action::Denied, &by.into());
         let note = note.with("code", Code::LineHeld).with("asked", "stop.attend").with("robot_id", robot_id);
         let certificate = by.certificate();
         inner.disk.denied(certificate.iter().fold(note, |note, serial| note.with("certificate", serial)), 0);
@@ -134,7 +137,7 @@ async fn hold(
         };
         let now = inner.clock.now();
         let over = match message {
-            Ok(Ok(Some(message))) => take(inner, robot, outbox, message, &now).err(),
+            Ok(Ok(Some(message))) => take_message(inner, robot, outbox, message, &now).err(),
             Ok(Ok(None)) => return outbox.end(End::Done, now.link),
             Ok(Err(status)) => match unreadable(&status) {
                 None => return outbox.end(End::Done, now.link),
@@ -155,7 +158,7 @@ fn late(what: &str) -> Refusal {
     Refusal::new(Kind::Deadline, Reason::new(Code::ProtocolError, text))
 }
 
-fn take(
+fn take_message(
     inner: &Inner,
     robot: &Robot,
     outbox: &Arc<Outbox>,

@@ -4,12 +4,13 @@
 //! stopped too. What cannot be read is moved aside and kept. Nobody changes a folder that another process has.
 
 use crate::audit::{self, Action, Audit, Note};
-use crate::disk::Writer;
+use crate::error::Error;
 use crate::first::{FIRST, withdraw_first_start};
+use crate::folder::LATCH;
 use crate::holder::Holder;
 use crate::law::{Kept, draw_unused};
 use crate::proof::{Found, Key};
-use crate::{Error, LATCH};
+use crate::writer::Writer;
 use midshift_core::limits;
 use midshift_core::robot::StopLevel;
 use midshift_core::stop::latch::{MEMORY_LOST, is_memory_lost};
@@ -106,7 +107,7 @@ pub fn open(folder: &Path, now: Utc) -> Result<Opened, Error> {
         notes.push(aside.iter().fold(note, |note, aside| note.with("moved_to", aside.display())));
     }
     if is_drawn {
-        key.keep(folder, now).map_err(failed)?;
+        key.write_into(folder, now).map_err(failed)?;
     }
     withdraw_first_start(folder).map_err(failed)?;
     let (audit, found) = Audit::open(folder, kept.audit.clone(), now);

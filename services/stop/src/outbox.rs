@@ -1,20 +1,20 @@
 //! What waits for one robot to read it.
 //!
 //! Invariant: bounded, and whoever puts something in never waits. A robot that reads too slowly is told everything anew from the latch when it reads again, so that
-//! nothing is lost by leaving messages out. An answer to a check-in never overtakes what it speaks of. The stream is read by the connection itself: no
-//! task stands between a stop and the socket.
+//! nothing is lost by leaving messages out. An answer to a check-in never overtakes what it speaks of.
 
-use crate::{Inner, frames, lock};
+use crate::frames;
+use crate::law::Law;
+use crate::proof::Key;
+use crate::threads::lock;
 use bytes::Bytes;
 use midshift_core::ids::StopId;
 use midshift_core::limits;
 use midshift_core::reason::Refusal;
 use midshift_core::time::{LinkDuration, LinkTime};
 use std::collections::{BTreeSet, VecDeque};
-use std::pin::Pin;
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, Waker};
-use tokio_stream::Stream;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
@@ -77,9 +77,9 @@ impl Outbox {
         Self { waiting: Mutex::new(waiting), gone: CancellationToken::new() }
     }
 
-    fn put(&self, now: LinkTime, put: impl FnOnce(&mut Waiting)) {
+    fn change_waiting(&self, now: LinkTime, change: impl FnOnce(&mut Waiting)) {
         let mut waiting = lock(&self.waiting);
-        put(&mut waiting);
+        change(&mut waiting);
         waiting.unread_since.get_or_insert(now);
         let waker = waiting.waker.take();
         drop(waiting);
@@ -89,8 +89,8 @@ impl Outbox {
     }
 
     /// A change of the latch.
-    pub fn tell(&self, frame: &Frame, now: LinkTime) {
-        self.put(now, |waiting| {
+    pub fn add_change(&self, frame: &Frame, now: LinkTime) {
+        self.change_waiting(now, |waiting| {
             if waiting.behind.is_none() && waiting.frames.len() < limits::STOP_OUTBOX_MAX {
                 return waiting.frames.push_back(frame.clone());
             }
@@ -103,7 +103,7 @@ impl Outbox {
 
     /// The answer to a check-in that came when the latch was at `generation`.
     pub fn answer(&self, nonce: u64, generation: u64, now: LinkTime) {
-        self.put(now, |waiting| {
+        self.change_waiting(now, |waiting| {
             if waiting.answers.len() >= limits::STOP_ANSWERS_MAX {
                 waiting.answers.pop_front();
             }
@@ -118,12 +118,12 @@ impl Outbox {
 
     /// The robot is to dial again.
     pub fn move_over(&self, now: LinkTime) {
-        self.put(now, |waiting| waiting.moves_over = true);
+        self.change_waiting(now, |waiting| waiting.moves_over = true);
     }
 
     /// The robot is to dial again, and this line ends when it has read what waits for it.
     pub fn finish(&self, now: LinkTime) {
-        self.put(now, |waiting| {
+        self.change_waiting(now, |waiting| {
             waiting.moves_over = true;
             waiting.end.get_or_insert(End::Done);
         });
@@ -132,7 +132,7 @@ impl Outbox {
 
     /// Ends the line.
     pub fn end(&self, end: End, now: LinkTime) {
-        self.put(now, |waiting| {
+        self.change_waiting(now, |waiting| {
             waiting.frames.clear();
             waiting.whole.clear();
             waiting.answers.clear();
@@ -152,6 +152,24 @@ impl Outbox {
         lock(&self.waiting).unread_since.map_or(LinkDuration(0), |since| now.since(since))
     }
 
+    /// What the connection sends next: of a robot that is behind, from the latch. Whoever puts something in later wakes it.
+    pub fn poll_next(&self, law: &Mutex<Law>, key: &Key, cx: &mut Context<'_>) -> Poll<Option<Result<Bytes, Status>>> {
+        let mut waiting = lock(&self.waiting);
+        if let Some(bytes) = waiting.next(law, key) {
+            return Poll::Ready(Some(Ok(bytes)));
+        }
+        // The connection takes more than there is.
+        waiting.unread_since = None;
+        match waiting.end.take() {
+            Some(End::Done) => Poll::Ready(None),
+            Some(End::Refused(refusal)) => Poll::Ready(Some(Err(midshift_proto::status(&refusal, None)))),
+            None => {
+                waiting.waker = Some(cx.waker().clone());
+                Poll::Pending
+            }
+        }
+    }
+
     #[cfg(test)]
     fn held(&self) -> (usize, usize) {
         let waiting = lock(&self.waiting);
@@ -159,37 +177,18 @@ impl Outbox {
     }
 }
 
-/// What the connection reads.
-pub struct Down {
-    inner: Arc<Inner>,
-    outbox: Arc<Outbox>,
-}
-
-impl Down {
-    /// Of an outbox.
-    pub fn new(inner: Arc<Inner>, outbox: Arc<Outbox>) -> Self {
-        Self { inner, outbox }
-    }
-}
-
-impl Drop for Down {
-    fn drop(&mut self) {
-        self.outbox.gone.cancel();
-    }
-}
-
 impl Waiting {
-    fn next(&mut self, inner: &Inner) -> Option<Bytes> {
+    fn next(&mut self, law: &Mutex<Law>, key: &Key) -> Option<Bytes> {
         if let Some(bytes) = self.whole.pop_front() {
             return Some(bytes);
         }
         if let Some(resets) = self.behind.take() {
-            let mut law = lock(&inner.law);
+            let mut law = lock(law);
             self.whole.extend(law.everything().iter().cloned());
             let resets = resets.iter().filter_map(|id| law.latch().reset_of(id));
             self.whole.extend(frames::told([], resets, 0));
             self.sent = law.generation();
-            self.whole.push_back(frames::synced(self.sent, &inner.key.public()));
+            self.whole.push_back(frames::synced(self.sent, &key.public()));
             return self.whole.pop_front();
         }
         while let Some(frame) = self.frames.pop_front() {
@@ -203,27 +202,6 @@ impl Waiting {
             return Some(frames::checked_in(nonce, self.sent));
         }
         std::mem::take(&mut self.moves_over).then(frames::move_over)
-    }
-}
-
-impl Stream for Down {
-    type Item = Result<Bytes, Status>;
-
-    fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        let mut waiting = lock(&self.outbox.waiting);
-        if let Some(bytes) = waiting.next(&self.inner) {
-            return Poll::Ready(Some(Ok(bytes)));
-        }
-        // The connection takes more than there is.
-        waiting.unread_since = None;
-        match waiting.end.take() {
-            Some(End::Done) => Poll::Ready(None),
-            Some(End::Refused(refusal)) => Poll::Ready(Some(Err(midshift_proto::status(&refusal, None)))),
-            None => {
-                waiting.waker = Some(cx.waker().clone());
-                Poll::Pending
-            }
-        }
     }
 }
 
@@ -247,7 +225,7 @@ mod tests {
         let outbox = Outbox::new(BTreeSet::new());
         lock(&outbox.waiting).behind = None;
         for n in 1..100_u64 {
-            outbox.tell(&frame(n, Some(&format!("STOP-{n}"))), LinkTime(5));
+            outbox.add_change(&frame(n, Some(&format!("STOP-{n}"))), LinkTime(5));
             outbox.answer(n, n, LinkTime(5));
             let (frames, answers) = outbox.held();
             assert!(frames <= limits::STOP_OUTBOX_MAX && answers <= limits::STOP_ANSWERS_MAX);
@@ -274,7 +252,8 @@ mod tests {
         };
         let stop_id = acts::engage(&inner, wanted).unwrap().stop.stop_id;
         let outbox = Outbox::new(BTreeSet::new());
-        let heard = || -> Vec<Bytes> { std::iter::from_fn(|| lock(&outbox.waiting).next(&inner)).collect() };
+        let heard =
+            || -> Vec<Bytes> { std::iter::from_fn(|| lock(&outbox.waiting).next(&inner.law, &inner.key)).collect() };
         heard();
         let resetting =
             acts::reset(&inner, stop_id, "over".to_owned(), &Caller::local()).expect("nobody is asked here");
@@ -285,7 +264,7 @@ mod tests {
         let synced = frames::synced(generation, &inner.key.public());
         assert!(heard().contains(&synced), "it is told the whole");
         let bytes = frames::told([], [&reset], generation).remove(0);
-        outbox.tell(&Frame { generation, bytes: bytes.clone(), resets: [reset.stop_id].into() }, LinkTime(5));
+        outbox.add_change(&Frame { generation, bytes: bytes.clone(), resets: [reset.stop_id].into() }, LinkTime(5));
         assert_eq!(heard(), [bytes]);
     }
 }

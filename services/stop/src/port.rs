@@ -2,7 +2,7 @@
 //!
 //! Invariant: whom the door denies something is recorded in the service's own file.
 
-use crate::StopService;
+use crate::service::{self, StopService};
 use anyhow::Context;
 use axum::routing::get;
 use midshift_core::Boxed;
@@ -59,7 +59,7 @@ async fn serve_all(
             () = recording => Ok(()),
         }
     };
-    crate::serve(service, port).await.context("serving stops")?
+    service::serve(service, port).await.context("serving stops")?
 }
 
 /// Records whom the port denies what in the stop service's own file, until it is dropped.

@@ -62,7 +62,7 @@ impl Key {
     }
 
     /// Writes it into the folder; one that is there, and is another, is moved aside.
-    pub fn keep(&self, folder: &Path, now: Utc) -> io::Result<()> {
+    pub fn write_into(&self, folder: &Path, now: Utc) -> io::Result<()> {
         let path = folder.join(NAME);
         if path.try_exists()? {
             audit::set_aside(&path, now)?;
@@ -121,7 +121,7 @@ mod tests {
     fn kept(folder: &Path) -> Key {
         assert!(matches!(Key::read(folder).unwrap(), Found::Gone));
         let key = Key::draw();
-        key.keep(folder, Utc(0)).unwrap();
+        key.write_into(folder, Utc(0)).unwrap();
         key
     }
 
@@ -192,7 +192,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         fs::write(folder.path().join(NAME), "no key").unwrap();
         assert!(matches!(Key::read(folder.path()).unwrap(), Found::Torn));
-        Key::draw().keep(folder.path(), Utc(7)).unwrap();
+        Key::draw().write_into(folder.path(), Utc(7)).unwrap();
         assert!(matches!(Key::read(folder.path()).unwrap(), Found::There(_)));
         assert_eq!(fs::read_to_string(folder.path().join("key.pem.broken-7")).unwrap(), "no key");
     }

@@ -2,8 +2,8 @@
 //!
 //! Invariant: bounded; each robot has a lock of its own that is held for moments, so that whoever reads of all robots holds up nobody.
 
-use crate::lock;
 use crate::outbox::{End, Frame, Outbox};
+use crate::threads::lock;
 use midshift_core::ids::{RobotId, StopId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
@@ -110,7 +110,7 @@ impl Robots {
     ///
     /// # Errors
     /// There is no room.
-    pub fn of(&self, robot_id: &RobotId) -> Result<Arc<Robot>, Refusal> {
+    pub fn find_or_add(&self, robot_id: &RobotId) -> Result<Arc<Robot>, Refusal> {
         if let Some(robot) = self.read().get(robot_id) {
             return Ok(robot.clone());
         }
@@ -169,11 +169,11 @@ impl Robots {
     }
 
     /// Tells all lines of a change.
-    pub fn tell(&self, frame: &Frame, now: LinkTime) -> usize {
+    pub fn tell_lines(&self, frame: &Frame, now: LinkTime) -> usize {
         let mut told = 0;
         for robot in self.read().values() {
             if let Some(line) = &robot.said().line {
-                line.tell(frame, now);
+                line.add_change(frame, now);
                 told += 1;
             }
         }
@@ -245,10 +245,10 @@ mod tests {
         let robots = Robots::default();
         let names = |robots: &Robots| robots.all().iter().map(|r| r.robot_id.to_string()).collect::<Vec<_>>().join(" ");
         robots.list(&[1, 2, 3].map(id).into(), LinkTime(0));
-        robots.of(&id(1)).unwrap().said().heard = Some(heard(LinkTime(9_000), Around::People));
-        robots.of(&id(2)).unwrap().said().heard = Some(heard(LinkTime(9_000), Around::Robots));
+        robots.find_or_add(&id(1)).unwrap().said().heard = Some(heard(LinkTime(9_000), Around::People));
+        robots.find_or_add(&id(2)).unwrap().said().heard = Some(heard(LinkTime(9_000), Around::Robots));
         // One that nobody ever listed: it has a line before it has a session.
-        robots.of(&id(4)).unwrap().said().heard = Some(heard(LinkTime(9_000), Around::People));
+        robots.find_or_add(&id(4)).unwrap().said().heard = Some(heard(LinkTime(9_000), Around::People));
         robots.list(&BTreeSet::new(), LinkTime(10_000));
         for (ms, left) in
             [(14_999, "r1 r2 r3 r4"), (15_000, "r2 r3 r4"), (39_000, "r3 r4"), (40_999, "r3 r4"), (41_000, "r4")]
@@ -271,11 +271,11 @@ mod tests {
     fn the_roster_is_bounded_and_who_nobody_lists_goes_first() {
         let robots = Robots::default();
         robots.list(&(1..limits::STOP_ROBOTS_MAX).map(id).collect(), LinkTime(0));
-        robots.of(&id(0)).unwrap();
-        robots.of(&id(99_999)).unwrap();
+        robots.find_or_add(&id(0)).unwrap();
+        robots.find_or_add(&id(99_999)).unwrap();
         assert_eq!(robots.all().len(), limits::STOP_ROBOTS_MAX);
         assert!(robots.all().iter().all(|robot| robot.robot_id != id(0)), "the stray one went");
-        robots.of(&id(99_999)).unwrap().said().line = Some(Arc::new(Outbox::new(BTreeSet::new())));
-        assert_eq!(robots.of(&id(99_998)).err().map(|refusal| refusal.kind()), Some(Kind::Exhausted));
+        robots.find_or_add(&id(99_999)).unwrap().said().line = Some(Arc::new(Outbox::new(BTreeSet::new())));
+        assert_eq!(robots.find_or_add(&id(99_998)).err().map(|refusal| refusal.kind()), Some(Kind::Exhausted));
     }
 }

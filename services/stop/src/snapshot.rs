@@ -3,7 +3,9 @@
 //! Invariant: written whole under another name and renamed, so that a reader never sees half; one that cannot be read is told once, and the last good
 //! one stays in force.
 
-use crate::{Inner, acts, blocking};
+use crate::acts;
+use crate::inner::Inner;
+use crate::threads::blocking;
 use midshift_core::identity::Directory;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
@@ -133,7 +135,11 @@ fn mark(path: &Path) -> Option<Mark> {
 }
 
 /// What stands in a file, if it is another one than `before`; an error inside: it cannot be read.
-fn look<T: DeserializeOwned>(path: &Path, bytes_max: u64, before: Option<Mark>) -> (Option<Mark>, Option<Found<T>>) {
+fn read_changed<T: DeserializeOwned>(
+    path: &Path,
+    bytes_max: u64,
+    before: Option<Mark>,
+) -> (Option<Mark>, Option<Found<T>>) {
     let now = mark(path);
     if now == before || now.is_none() {
         return (before, None);
@@ -160,8 +166,8 @@ struct Looked {
 }
 
 fn look_at_both(folder: &Path, marks: [Option<Mark>; 2]) -> Looked {
-    let (of_roster, roster) = look(&folder.join(ROSTER), BYTES_MAX, marks[0]);
-    let (of_copied, copied) = look(&folder.join(Copied::NAME), limits::STOP_LATCH_BYTES as u64, marks[1]);
+    let (of_roster, roster) = read_changed(&folder.join(ROSTER), BYTES_MAX, marks[0]);
+    let (of_copied, copied) = read_changed(&folder.join(Copied::NAME), limits::STOP_LATCH_BYTES as u64, marks[1]);
     Looked { marks: [of_roster, of_copied], roster, copied }
 }
 

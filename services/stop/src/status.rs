@@ -2,8 +2,9 @@
 //!
 //! Invariant: counts are those of [`confirmation`], robot by robot and stop by stop, made without asking each robot about each stop.
 
-use crate::confirm::count;
-use crate::{Inner, Times, lock};
+use crate::confirm::{count, wall_at};
+use crate::inner::Inner;
+use crate::threads::lock;
 use midshift_core::ids::{RobotId, StopId};
 use midshift_core::limits;
 use midshift_core::stop::roster::{Heard, confirmation, means_everywhere};
@@ -113,7 +114,7 @@ pub fn status(inner: &Inner) -> v1::Status {
             robot_id: robot.robot_id.to_string(),
             obeys: heard.map(|h| h.level).unwrap_or_default().to_wire(),
             standstill: heard.is_some_and(|h| h.is_still),
-            heard_unix_ms: heard.map_or(0, |h| now.wall_at(h.at).0),
+            heard_unix_ms: heard.map_or(0, |h| wall_at(&now, h.at).0),
             awaiting_resume: heard.map(|h| names(&h.awaiting)).unwrap_or_default(),
             foreign_stops: names(said.foreign.difference(&resets)),
             durable: heard.is_some_and(|h| h.is_durable),
@@ -144,7 +145,7 @@ fn still(status: &v1::Status) -> v1::Status {
 }
 
 /// Tells the whole, again when it has changed, until the reader leaves.
-pub async fn tell(inner: &Inner, sender: mpsc::Sender<Result<v1::WatchStatusResponse, Status>>) {
+pub async fn tell_status(inner: &Inner, sender: mpsc::Sender<Result<v1::WatchStatusResponse, Status>>) {
     let mut changed = inner.changed.subscribe();
     let mut told: Option<(v1::Status, tokio::time::Instant)> = None;
     loop {

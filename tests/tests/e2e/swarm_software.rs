@@ -172,8 +172,13 @@ impl Bench {
         let made = make(&dir.path().join("samples"))?;
         let keys = made.keys.clone().context("has keys")?;
         let folder = dir.path().join("server");
-        let parts =
-            Parts { folder, keys: keys.clone(), room: Room::of(1 << 20), clock: clock.clone(), owner: Owner::Nobody };
+        let parts = Parts {
+            folder,
+            keys: keys.clone(),
+            room: Room::with_quota(1 << 20),
+            clock: clock.clone(),
+            owner: Owner::Nobody,
+        };
         let ota = OtaService::open(parts).await?;
         let (ends, incoming) = mpsc::channel(4);
         let (seen, sessions) = mpsc::channel(4);

@@ -114,7 +114,8 @@ impl Software {
         files: Vec<(String, Vec<u8>)>,
         now: Utc,
     ) -> anyhow::Result<()> {
-        let content = DiskContent::open(&self.folder().join("content"), Room::of(limits::SOFTWARE_BYTES_DEFAULT))?;
+        let content =
+            DiskContent::open(&self.folder().join("content"), Room::with_quota(limits::SOFTWARE_BYTES_DEFAULT))?;
         for (_, bytes) in files {
             let file = Wanted { digest: Digest::of(&bytes), length: bytes.len() as u64 };
             content.append(file, 0, bytes.into()).await?;
@@ -134,7 +135,7 @@ impl Software {
     }
     /// The service of a server that starts now.
     pub async fn open(&self, clock: Arc<dyn Clock>) -> anyhow::Result<OtaService> {
-        let room = Room::of(limits::SOFTWARE_BYTES_DEFAULT);
+        let room = Room::with_quota(limits::SOFTWARE_BYTES_DEFAULT);
         Ok(OtaService::open(Parts { folder: self.folder(), keys: self.keys(), room, clock, owner: Owner::Nobody })
             .await?)
     }

@@ -87,7 +87,7 @@ async fn rows_of_postgresql_and_their_releases_become_one_store_of_its_own() {
     let owned = |folder: &Path| Parts {
         folder: folder.join("ota"),
         keys: keys.clone(),
-        room: Room::of(1 << 30),
+        room: Room::with_quota(1 << 30),
         clock: clock::clock(1000),
         owner: Owner::Shared { store_id: store.id().clone(), known_bundles: 1 },
     };

@@ -146,7 +146,7 @@ async fn nothing_is_written_over() {
 
 async fn repository(data: &Path, keys: &Path) -> (Arc<DiskContent>, Repository) {
     let ota = data.join("ota");
-    let content = Arc::new(DiskContent::open(&ota.join("content"), Room::of(1 << 30)).expect("a store"));
+    let content = Arc::new(DiskContent::open(&ota.join("content"), Room::with_quota(1 << 30)).expect("a store"));
     let keys = OnlineKeys::read(keys).expect("keys");
     let repository = Repository::open(&ota.join("metadata"), keys, content.clone()).await.expect("a repository");
     (content, repository)
@@ -208,7 +208,7 @@ async fn restored_releases_belong_to_the_restored_store_and_those_of_the_lost_on
     let owned = |folder: &Path| Parts {
         folder: folder.to_owned(),
         keys: keys.clone(),
-        room: Room::of(1 << 30),
+        room: Room::with_quota(1 << 30),
         clock: clock::clock(1000),
         owner: Owner::Shared { store_id: store.id().clone(), known_bundles: 1 },
     };

@@ -30,7 +30,7 @@ impl Throwaway {
             let this = Self { dir: tempfile::tempdir().context("making a folder for software")? };
             Folder::create(&this.repository(), &this.keys(), Profile::Solo, clock.now().wall)?;
             // No databases lie beside it that would need the rest of the disk.
-            let room = Room::of(limits::SOFTWARE_BYTES_DEFAULT);
+            let room = Room::with_quota(limits::SOFTWARE_BYTES_DEFAULT);
             let parts =
                 Parts { folder: this.dir.path().join("server"), keys: this.keys(), room, clock, owner: Owner::Nobody };
             let service = OtaService::open(parts).await.context("opening software of robots")?;

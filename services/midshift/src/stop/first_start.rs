@@ -25,7 +25,7 @@ pub enum Occasion {
 /// # Errors
 /// The disk or the store; or a person asked for it and it is no first start.
 pub async fn announce(folder: &Path, store: &dyn Store, occasion: Occasion) -> anyhow::Result<()> {
-    let (history, is_new) = look(store).await.context("reading what the store knows of robots and stops")?;
+    let (history, is_new) = read_history(store).await.context("reading what the store knows of robots and stops")?;
     if let Some(history) = history {
         if midshift_stop::withdraw_first_start(folder).context("taking back a first start")? {
             tracing::warn!(
@@ -69,7 +69,7 @@ const TABLES: &[Table] = &[
 ];
 
 /// What the store has of robots and stops, in words; none: nothing. And whether no server has written to it yet.
-async fn look(store: &dyn Store) -> anyhow::Result<(Option<String>, bool)> {
+async fn read_history(store: &dyn Store) -> anyhow::Result<(Option<String>, bool)> {
     let snapshot = store.snapshot(TABLES).await?;
     let count = |table: Table| snapshot.rows.iter().filter(|row| row.key.table == table).count();
     let mut enrolled = 0;

@@ -134,7 +134,7 @@ impl Started {
 
     /// Looks after it until the task is ended: one that is gone is started again, before robots among people slow down for want of an answer. `child`: what
     /// [`Started::start`] has started.
-    pub async fn keep(&self, mut child: Option<Child>, store: &dyn Store) {
+    pub async fn keep_running(&self, mut child: Option<Child>, store: &dyn Store) {
         let (mut pause, mut watch) = (Duration::ZERO, Watch::default());
         loop {
             let begun = Instant::now();

@@ -3,9 +3,8 @@
 //! Invariant: nothing that was remembered from an earlier turn counts unless the disk says the same. Of a file that is not whole the
 //! mark says who wrote to it last; who finds another there begins from what lies on the disk.
 
-use super::{Changed, DiskContent, Entry, Error, Hand, Inner, Mark, Part, Room, Sharing, Shelf, Whole, at};
-use super::{read_mark, remove};
-use crate::disk::{sync_folder, write_whole};
+use super::{Changed, DiskContent, Entry, Hand, Inner, Mark, Part, Room, Sharing, Shelf, Whole, read_mark, remove};
+use crate::disk::{Error, at, sync_folder, write_whole};
 use midshift_bundle::digest::Digest;
 use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, UTIME_NOW, utimensat};
 use std::collections::BTreeMap;
@@ -60,7 +59,8 @@ impl DiskContent {
 
     /// A folder that other processes keep, to be read only. It need not be there yet.
     pub fn reading(path: &Path) -> Self {
-        let inner = Inner { path: path.to_owned(), room: Room::of(0), hand: Hand::Reading, shelf: Mutex::default() };
+        let inner =
+            Inner { path: path.to_owned(), room: Room::with_quota(0), hand: Hand::Reading, shelf: Mutex::default() };
         Self { inner: Arc::new(inner) }
     }
 }
@@ -115,7 +115,7 @@ impl Inner {
     }
 
     /// Makes what is remembered be what is there. It is our turn.
-    pub(super) fn look(&self) -> Result<(), Error> {
+    pub(super) fn refresh_shelf(&self) -> Result<(), Error> {
         let Hand::Shared(sharing) = &self.hand else { return Ok(()) };
         let found = there(&self.path)?;
         let mut shelf = self.shelf();

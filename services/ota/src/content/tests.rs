@@ -13,7 +13,7 @@ use tokio::io::AsyncReadExt;
 const QUOTA: u64 = 1024 * 1024;
 
 fn store(dir: &TempDir) -> DiskContent {
-    DiskContent::open(dir.path(), Room::of(QUOTA)).expect("a store")
+    DiskContent::open(dir.path(), Room::with_quota(QUOTA)).expect("a store")
 }
 
 fn wanted(content: &[u8]) -> Wanted {
@@ -169,7 +169,7 @@ async fn the_quota_counts_whole_files_and_parts_over_restarts() {
 #[tokio::test]
 async fn sizes_beyond_the_cap_and_bytes_beyond_the_whole_are_refused() {
     let dir = TempDir::new().expect("a folder");
-    let store = DiskContent::open(dir.path(), Room::of(u64::MAX)).expect("a store");
+    let store = DiskContent::open(dir.path(), Room::with_quota(u64::MAX)).expect("a store");
     let digest = Digest::of(b"any");
     for length in [0, COMPONENT_BYTES_MAX + 1, u64::MAX] {
         let error = store.append(Wanted { digest, length }, 0, Bytes::from_static(b"x")).await.expect_err("refused");
@@ -206,7 +206,7 @@ async fn ranges_around_two_and_four_gib_are_where_they_should_be() {
         std::os::unix::fs::FileExt::write_all_at(&file, b"edge", edge - 2).expect("sparse");
     }
     file.set_len((1 << 32) + 10).expect("sparse");
-    let store = DiskContent::open(dir.path(), Room::of(u64::MAX)).expect("a store");
+    let store = DiskContent::open(dir.path(), Room::with_quota(u64::MAX)).expect("a store");
     assert_eq!(store.length(digest).await.expect("asked"), Some((1 << 32) + 10));
     for edge in [1_u64 << 31, 1 << 32] {
         assert_eq!(read(&store, digest, edge - 2..edge + 2).await, b"edge");
@@ -259,13 +259,13 @@ async fn what_is_refused_for_want_of_room_leaves_nothing_behind_and_what_began_c
 async fn the_disk_keeps_its_spare_bytes() {
     let dir = TempDir::new().expect("a folder");
     let spare_bytes = 1 << 62;
-    let store = DiskContent::open(dir.path(), Room { spare_bytes, ..Room::of(QUOTA) }).expect("a store");
+    let store = DiskContent::open(dir.path(), Room { spare_bytes, ..Room::with_quota(QUOTA) }).expect("a store");
     let error = bring(&store, b"abc").await.expect_err("no disk has so much");
     let Error::DiskFull { missing: 3, free, spare } = error else { panic!("{error}") };
     assert_eq!((spare, free > 0), (spare_bytes, true));
     assert_eq!(names(dir.path()), Vec::<String>::new());
     drop(store);
-    let modest = DiskContent::open(dir.path(), Room { spare_bytes: 1, ..Room::of(QUOTA) }).expect("a store");
+    let modest = DiskContent::open(dir.path(), Room { spare_bytes: 1, ..Room::with_quota(QUOTA) }).expect("a store");
     assert_eq!(bring(&modest, b"abc").await.expect("whole"), Held::Whole);
 }
 

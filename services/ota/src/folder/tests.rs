@@ -154,7 +154,7 @@ async fn the_lock_of_a_process_that_is_killed_is_free() {
     BufReader::new(holder.stdout.as_mut().expect("a pipe")).read_line(&mut answer).expect("an answer");
     assert_eq!(answer, "held\n");
     let gate = Gate::new(Some(path));
-    let mut taking = Box::pin(gate.take());
+    let mut taking = Box::pin(gate.take_turn());
     tokio::select! {
         biased;
         _ = &mut taking => panic!("it is held"),
@@ -169,8 +169,8 @@ async fn the_lock_of_a_process_that_is_killed_is_free() {
 async fn nobody_waits_for_a_turn_without_end() {
     let dir = TempDir::new().expect("a folder");
     let gate = || Gate::new(Some(dir.path().join("gate.lock")));
-    let held = gate().take().await.expect("free");
-    assert!(matches!(gate().take().await, Err(crate::content::Error::Busy { .. })));
+    let held = gate().take_turn().await.expect("free");
+    assert!(matches!(gate().take_turn().await, Err(crate::content::Error::Busy { .. })));
     drop(held);
-    gate().take().await.expect("free again");
+    gate().take_turn().await.expect("free again");
 }

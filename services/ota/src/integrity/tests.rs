@@ -37,16 +37,16 @@ async fn a_file_that_was_damaged_is_not_handed_out_and_can_be_brought_again() {
     let opened = service.opened().expect("keys");
     let file = Wanted { digest: Digest::of(&content), length: content.len() as u64 };
     std::fs::write(&path, vec![0; content.len()]).expect("damaged");
-    let refusal = opened.hatch.listed(file.digest).await.expect_err("it is damaged");
+    let refusal = opened.downloads.listed(file.digest).await.expect_err("it is damaged");
     assert_eq!(refusal.reason.code, Code::SoftwareNotFound);
-    let damaged = opened.hatch.damaged();
+    let damaged = opened.downloads.damaged();
     assert_eq!(damaged.iter().copied().collect::<Vec<_>>(), [file.digest]);
-    assert_eq!(opened.hatch.damaged(), damaged, "it is kept until somebody was told");
-    opened.hatch.told_damaged(&damaged);
-    assert!(opened.hatch.damaged().is_empty(), "it is told once");
+    assert_eq!(opened.downloads.damaged(), damaged, "it is kept until somebody was told");
+    opened.downloads.told_damaged(&damaged);
+    assert!(opened.downloads.damaged().is_empty(), "it is told once");
     opened.content.append(file, 0, content.into()).await.expect("room");
     assert_eq!(opened.content.settle(file).await.expect("whole"), Held::Whole);
-    assert_eq!(opened.hatch.listed(file.digest).await.expect("handed out"), file);
+    assert_eq!(opened.downloads.listed(file.digest).await.expect("handed out"), file);
 }
 
 #[tokio::test(start_paused = true)]
@@ -54,9 +54,9 @@ async fn a_file_is_hashed_the_first_time_and_once_a_day() {
     let (_dir, service, content, path) = world().await;
     let opened = service.opened().expect("keys");
     let digest = Digest::of(&content);
-    opened.hatch.listed(digest).await.expect("whole");
+    opened.downloads.listed(digest).await.expect("whole");
     std::fs::write(&path, vec![0; content.len()]).expect("damaged");
-    opened.hatch.listed(digest).await.expect("it was hashed a moment ago");
+    opened.downloads.listed(digest).await.expect("it was hashed a moment ago");
     tokio::time::advance(EVERY).await;
-    assert!(opened.hatch.listed(digest).await.is_err(), "a day later it is hashed again");
+    assert!(opened.downloads.listed(digest).await.is_err(), "a day later it is hashed again");
 }

@@ -2,7 +2,9 @@
 //!
 //! Invariant: nothing is written here, and all that is wrong with an offer is told at once as far as it can be known.
 
-use super::{Error, Kept, Newest, OnlineKeys, Release};
+use super::error::{Error, io};
+use super::newest::{Kept, Newest, Release};
+use super::online::OnlineKeys;
 use crate::content::Content;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::freshness::{root_edition, targets_edition};
@@ -187,7 +189,7 @@ async fn bytes_of(digest: Digest, most: u64, content: &dyn Content) -> Result<Op
     let Some(mut reader) = content.read(digest, 0..most + 1).await? else { return Ok(None) };
     let mut bytes = Vec::new();
     let read = reader.read_to_end(&mut bytes).await;
-    read.map_err(super::io("reading", Path::new(&digest.to_string())))?;
+    read.map_err(io("reading", Path::new(&digest.to_string())))?;
     Ok(Some(bytes))
 }
 

@@ -4,19 +4,26 @@
 //! number, is damaged, and what was shown before stays. A file that the disk does not give at the moment is not gone: what was known of it
 //! stays, and it is tried again each time the folder is followed, once a second; never by whoever only asks for something.
 
-use super::{By, Error, Kept, Newest, Online, Release, SetLost, TIMESTAMP, check, file, read, read_by, read_seen};
-use crate::blocking;
+use super::check;
+use super::error::Error;
+use super::files::{TIMESTAMP, file, read, read_by, read_seen};
+use super::keyless::SetLost;
+use super::newest::{By, Kept, Newest, Release};
 use crate::content::Content;
+use crate::threads::blocking;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::freshness::{Stamp, check_online, newest_targets, root_edition, stamp, targets_edition};
 use midshift_bundle::key_set::KeySet;
-use midshift_bundle::repository::{FileTarget, check_root, listed};
+use midshift_bundle::repository::{FileTarget, Online, check_root, listed};
+use midshift_core::limits;
 use midshift_core::time::Utc;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, PoisonError, RwLock};
+use std::time::Duration;
 use tokio::sync::Mutex;
+use tokio_util::sync::CancellationToken;
 
 /// So often a folder is read anew that changed while it was read.
 const READS_MAX: usize = 8;
@@ -49,7 +56,7 @@ impl Documents {
             following: Arc::default(),
             is_failing: Arc::default(),
         };
-        this.take(Unread::Again).await?;
+        this.read_folder(Unread::Again).await?;
         Ok(this)
     }
 
@@ -85,7 +92,7 @@ impl Documents {
             return Ok(());
         }
         let _one = self.following.lock().await;
-        self.take(Unread::Again).await
+        self.read_folder(Unread::Again).await
     }
 
     /// As [`Documents::follow`]; if it begins to fail, that is logged.
@@ -102,7 +109,7 @@ impl Documents {
         }
         let looked = {
             let _one = self.following.lock().await;
-            self.take(Unread::Left).await
+            self.read_folder(Unread::Left).await
         };
         self.tell_failing(looked);
     }
@@ -118,7 +125,7 @@ impl Documents {
         }
     }
 
-    async fn take(&self, unread: Unread) -> Result<(), Error> {
+    async fn read_folder(&self, unread: Unread) -> Result<(), Error> {
         let mut tries = 1;
         loop {
             let before = self.newest();
@@ -138,7 +145,7 @@ impl Documents {
                 Ok(None) => Err(self.damaged(format!("{TIMESTAMP} is gone"))),
                 Ok(Some(found)) => match found.complete(self.content.as_ref(), before.as_deref()).await {
                     Ok((newest, unread)) => {
-                        self.show(before.as_ref(), newest).map(|()| tell(before.as_deref(), &unread))
+                        self.show(before.as_ref(), newest).map(|()| tell_unread(before.as_deref(), &unread))
                     }
                     Err(error) => Err(error),
                 },
@@ -146,7 +153,7 @@ impl Documents {
             };
             let Err(error) = taken else { return Ok(()) };
             let folder = self.folder.clone();
-            let now = blocking(move || super::read(&folder.join(TIMESTAMP))).await?;
+            let now = blocking(move || super::files::read(&folder.join(TIMESTAMP))).await?;
             // Somebody published while it was read.
             if now == timestamp || tries >= READS_MAX {
                 return Err(error);
@@ -304,13 +311,13 @@ impl Found {
                 }
             }
         }
-        let newest = Newest::of(self.root, self.targets, self.stamp, files, releases, self.timestamp);
+        let newest = Newest::new(self.root, self.targets, self.stamp, files, releases, self.timestamp);
         Ok((Newest { key_set, set_lost, by: self.by, unread: unread.keys().copied().collect(), ..newest }, unread))
     }
 }
 
 /// Says once that files cannot be read, and once that they can again.
-fn tell(before: Option<&Newest>, unread: &Missed) {
+fn tell_unread(before: Option<&Newest>, unread: &Missed) {
     let is_known = |digest: &Digest| before.is_some_and(|before| before.unread.contains(digest));
     for (digest, (file, why)) in unread.iter().filter(|(digest, _)| !is_known(digest)) {
         match why {
@@ -366,4 +373,15 @@ fn find(folder: &Path) -> Result<Option<Found>, Error> {
         seen: read_seen(folder)?,
         by: read_by(folder)?,
     }))
+}
+
+/// Follows what other processes publish.
+pub(crate) async fn every_second<F: Future<Output = ()>>(shutdown: &CancellationToken, follow: impl Fn() -> F) {
+    loop {
+        follow().await;
+        tokio::select! {
+            () = shutdown.cancelled() => return,
+            () = tokio::time::sleep(Duration::from_millis(limits::SOFTWARE_FOLLOW_EVERY_MS)) => {}
+        }
+    }
 }

@@ -2,7 +2,9 @@
 //!
 //! Invariant: only a key that the newest root, or the newest set of directive keys, names signs anything.
 
-use super::{Error, Kept, Keyless, Newest, io};
+use super::error::{Error, io};
+use super::keyless::Keyless;
+use super::newest::{Kept, Newest};
 use midshift_bundle::freshness::{self, OnlineRole, check_online};
 use midshift_bundle::key_set::KeySet;
 use midshift_bundle::keys::SecretKey;

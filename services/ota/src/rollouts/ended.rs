@@ -3,8 +3,8 @@
 //!
 //! Invariant: a roll-out is read with all its robots, at one moment.
 
-use super::Request;
 use super::reconcile::Loop;
+use super::requests::Request;
 use midshift_core::ids::RolloutId;
 use midshift_core::rollout::ended;
 use midshift_core::rows::{Key, Part, Table};

@@ -1,7 +1,8 @@
 //! The gRPC face of roll-outs: decode, call, encode.
 
+use super::service::RolloutService;
 use super::watch::Countdowns;
-use super::{RolloutService, decode, encode, watch};
+use super::{decode, encode, watch};
 use crate::repository::Release;
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{BundleId, RequestId, RobotId, RolloutId};

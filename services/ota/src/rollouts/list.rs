@@ -3,8 +3,8 @@
 //!
 //! Invariant: a page costs its own roll-outs and their robots, whatever else has ended.
 
-use super::RolloutService;
 use super::encode::{self, Counts};
+use super::service::RolloutService;
 use midshift_core::identity::Caller;
 use midshift_core::ids::RolloutId;
 use midshift_core::limits;

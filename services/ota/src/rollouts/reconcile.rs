@@ -6,32 +6,61 @@
 //! takes releases and signs, and one that could not say so for a while reads the rows again before it does.
 
 use super::directives::Signer;
-use super::{Asked, Parts, Planner, Question, Request, releases};
+use super::releases;
+use super::requests::{Asked, Question, Request};
 use crate::collect::Named;
+use crate::service::OtaService;
+use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
 use midshift_core::lead::{OtaLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
+use midshift_core::rollout::bugs::Bugs;
 use midshift_core::rollout::projection::View;
 use midshift_core::rollout::requests::{CheckOnly, Taken};
 use midshift_core::rollout::retention::needed_bundles;
 use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, cycle, decide_request, ended, obeyed, tell_damaged};
 use midshift_core::rows::{Entry, Item, Log, Seq, Table};
-use midshift_core::time::Now;
+use midshift_core::site::Site;
+use midshift_core::time::{Clock, Now};
 use midshift_core::work::Live;
 use midshift_store::lead::{self, Settled};
-use midshift_store::{Applied, CommitError, Dirty, Error, Store, follow};
+use midshift_store::{Applied, CommitError, Dirty, Error, LiveBoard, Store, follow};
 use std::collections::BTreeSet;
 use std::ops::Range;
+use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::watch;
+use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
 /// Pause after the store failed, before everything is read again.
 const STORE_RETRY: Duration = Duration::from_millis(200);
 /// Requests taken into one cycle.
 const REQUESTS_PER_CYCLE: usize = 64;
+
+/// What the service is built from.
+pub struct Parts {
+    /// The memory that services share.
+    pub store: Arc<dyn Store>,
+    /// Newest heartbeats, written by telemetry.
+    pub board: Arc<LiveBoard<Live>>,
+    /// The site.
+    pub site: Arc<Site>,
+    /// Where the time of the wall, the link and the site is read.
+    pub clock: Arc<dyn Clock>,
+    /// Releases and keys.
+    pub ota: OtaService,
+    /// Naive rules for twins of tests; none outside them.
+    pub bugs: Bugs,
+}
+
+/// The part that runs.
+pub struct Planner {
+    pub(super) parts: Parts,
+    pub(super) requests: mpsc::Receiver<Request>,
+    pub(super) changed: watch::Sender<Seq>,
+}
 
 pub(super) struct Loop {
     pub(super) parts: Parts,
@@ -58,8 +87,18 @@ pub(super) struct Loop {
 /// Commands, what is answered, and the items of a plan that must be committed before.
 type Replies = Vec<(Box<Asked>, Taken, Range<usize>)>;
 
+impl Planner {
+    /// Runs until `shutdown`. On a server without keys it only waits: nothing can be signed.
+    ///
+    /// # Errors
+    /// Never by itself; the caller's services end alike.
+    pub fn run(self, shutdown: CancellationToken) -> Boxed<'static, Result<(), Error>> {
+        Box::pin(run(self, shutdown))
+    }
+}
+
 /// Runs until `shutdown`.
-pub async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Error> {
+async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Error> {
     let Planner { parts, mut requests, changed } = planner;
     if parts.ota.opened().is_err() {
         shutdown.cancelled().await;
@@ -304,7 +343,7 @@ impl Loop {
         // Rows that another process committed from what it published are not undone.
         opened.repository.documents().look_if_possible().await;
         releases::take_release(&mut self.view, now, opened.repository.newest().as_deref(), &mut plan);
-        let damaged = opened.hatch.damaged();
+        let damaged = opened.downloads.damaged();
         for digest in &damaged {
             tell_damaged(&mut self.view, now, &digest.to_string(), &mut plan);
         }
@@ -328,7 +367,7 @@ impl Loop {
             tracing::error!(text, "roll-outs passed over something they cannot read");
         }
         self.renew_and_commit(renewal, now, plan, replies).await?;
-        opened.hatch.told_damaged(&damaged);
+        opened.downloads.told_damaged(&damaged);
         self.answer(now);
         if let Some(seq) = foreign {
             self.changed.send_replace(seq);

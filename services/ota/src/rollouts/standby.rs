@@ -4,8 +4,8 @@
 //! signs nothing. A command is decided on the picture, committed on the condition that nothing of it has changed, and
 //! decided anew if something has; the process that leads obeys what is written.
 
-use super::Request;
 use super::reconcile::Loop;
+use super::requests::Request;
 use midshift_core::limits;
 use midshift_core::picture;
 use midshift_core::reason::{Code, Kind, Refusal};
@@ -73,7 +73,7 @@ impl Loop {
     /// Tells people of files that were found damaged here: the process that leads may never read them.
     async fn tell_damaged(&mut self) {
         let ota = self.parts.ota.clone();
-        let damaged = ota.opened().map(|opened| opened.hatch.damaged()).unwrap_or_default();
+        let damaged = ota.opened().map(|opened| opened.downloads.damaged()).unwrap_or_default();
         if damaged.is_empty() {
             return;
         }
@@ -83,7 +83,7 @@ impl Loop {
         }
         let results = self.parts.store.commit(plan.items).await;
         match (results.into_iter().find_map(Result::err), ota.opened()) {
-            (None, Ok(opened)) => opened.hatch.told_damaged(&damaged),
+            (None, Ok(opened)) => opened.downloads.told_damaged(&damaged),
             (Some(error), _) => tracing::warn!(%error, "people were not told of a damaged file; it is tried again"),
             // One without keys hands nothing out.
             (None, Err(_)) => {}

@@ -7,7 +7,8 @@
 //! whether the process leads or not, and holds committed rows alone. So a client that goes on at another process is
 //! told no older row than it was told before.
 
-use super::{RolloutService, encode};
+use super::encode;
+use super::service::RolloutService;
 use midshift_core::gates::TaskTally;
 use midshift_core::identity::Caller;
 use midshift_core::ids::RolloutId;

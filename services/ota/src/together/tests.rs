@@ -2,11 +2,12 @@
 
 use crate::collect::{Collected, Named};
 use crate::content::{Error, Held, Room, Wanted};
+use crate::downloads::Downloads;
 use crate::fixture::{SEEDS, START, files, first_root, noise, robot, root, targets, write_keys};
 use crate::folder::Owner;
-use crate::hatch::Hatch;
+use crate::opened::Opened;
 use crate::repository::{self, Act, FRESHEN_AFTER_MS};
-use crate::{Opened, OtaReader, OtaService, Parts};
+use crate::{OtaReader, OtaService, Parts};
 use bytes::Bytes;
 use http::{Request as Get, StatusCode};
 use midshift_bundle::digest::Digest;
@@ -60,7 +61,7 @@ impl Site {
         let parts = Parts {
             folder: self.folder(),
             keys: self.dir.path().join("keys"),
-            room: Room { unnamed_ms: UNNAMED_MS, ..Room::of(self.quota_bytes) },
+            room: Room { unnamed_ms: UNNAMED_MS, ..Room::with_quota(self.quota_bytes) },
             clock: Arc::new(ScaledClock::new(move || us.load(Relaxed), START, 1000)),
             owner: Owner::Shared { store_id: self.id(), known_bundles: 0 },
         };
@@ -264,21 +265,21 @@ async fn freshness_is_signed_by_one_of_them_and_its_versions_never_fork() {
         let told = opened(comes_late).repository.freshen(now).await.expect("looked");
         assert_eq!(told, Some(FRESHEN_AFTER_MS), "it is fresh");
         assert_eq!((shown(&one).await, shown(&two).await), ((half_day + 1, 1), (half_day + 1, 1)));
-        trusted = refreshed(&trusted, &[&one, &two][half_day as usize % 2].hatch(), now).await;
+        trusted = refreshed(&trusted, &[&one, &two][half_day as usize % 2].downloads(), now).await;
     }
 }
 
 /// What a robot believes after it looked.
 async fn refreshed(
     robot: &midshift_bundle::trust::Trusted,
-    hatch: &Hatch,
+    downloads: &Downloads,
     now: Utc,
 ) -> midshift_bundle::trust::Trusted {
     let reading = midshift_bundle::trust::Reading { utc: now, is_synced: true };
-    robot.refresh(Arc::new(Shown(hatch.clone())), reading).await.expect("believed").trusted
+    robot.refresh(Arc::new(Shown(downloads.clone())), reading).await.expect("believed").trusted
 }
 
-struct Shown(Hatch);
+struct Shown(Downloads);
 
 impl std::fmt::Debug for Shown {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
@@ -304,7 +305,7 @@ async fn a_process_killed_at_any_write_of_a_publication_leaves_the_other_able_to
         let (one, two) = (site.process().await, site.process().await);
         let first = publish(&one, None, &files("walk", "1.0.0"), 0).await.expect("published");
         assert_eq!(shown(&two).await, (1, 1));
-        let trusted = refreshed(&robot(), &two.hatch(), START).await;
+        let trusted = refreshed(&robot(), &two.downloads(), START).await;
         for (_, content) in &more {
             bring(&one, content).await;
         }
@@ -320,11 +321,11 @@ async fn a_process_killed_at_any_write_of_a_publication_leaves_the_other_able_to
         drop(one);
         let is_published = cut == writes.len();
         assert_eq!(shown(&two).await, if is_published { (2, 2) } else { (1, 1) }, "after {cut} writes");
-        refreshed(&trusted, &two.hatch(), START).await;
+        refreshed(&trusted, &two.downloads(), START).await;
         let again =
             opened(&two).repository.publish(roots, document, 1, Act::of_release(START)).await.expect("sent again");
         assert_eq!((again.root.edition.version, again.targets.edition.version, again.stamp.version), (2, 2, 2));
-        refreshed(&trusted, &site.reader().await.hatch, START).await;
+        refreshed(&trusted, &site.reader().await.downloads, START).await;
         if is_published {
             break;
         }
@@ -406,15 +407,15 @@ async fn a_folder_put_back_under_processes_at_work_is_shown_to_nobody_and_signed
     assert!(error.contains("put back under a server at work"), "{error}");
 }
 
-async fn encoding(hatch: &Hatch, digest: Digest, bases: &[Digest]) -> Result<v1::GetEncodingResponse, Status> {
+async fn encoding(downloads: &Downloads, digest: Digest, bases: &[Digest]) -> Result<v1::GetEncodingResponse, Status> {
     let base_digests = bases.iter().map(Digest::to_string).collect();
     let request = v1::GetEncodingRequest { digest: digest.to_string(), base_digests };
-    hatch.get_encoding(Request::new(request)).await.map(tonic::Response::into_inner)
+    downloads.get_encoding(Request::new(request)).await.map(tonic::Response::into_inner)
 }
 
-async fn fetched(hatch: &Hatch, digest: Digest, length: u64) -> Result<Vec<u8>, Status> {
+async fn fetched(downloads: &Downloads, digest: Digest, length: u64) -> Result<Vec<u8>, Status> {
     let request = v1::FetchChunksRequest { digest: digest.to_string(), offset: 0, length };
-    let mut stream = hatch.fetch_chunks(Request::new(request)).await?.into_inner();
+    let mut stream = downloads.fetch_chunks(Request::new(request)).await?.into_inner();
     let mut bytes = Vec::new();
     while let Some(chunk) = stream.next().await {
         bytes.extend(chunk?.data);
@@ -432,12 +433,12 @@ async fn a_gateway_hands_out_what_others_publish_and_writes_nothing() {
     for (_, content) in &walk {
         bring(&one, content).await;
     }
-    let refused = fetched(&reader.hatch, digest, content.len() as u64).await.expect_err("nobody published it");
+    let refused = fetched(&reader.downloads, digest, content.len() as u64).await.expect_err("nobody published it");
     assert_eq!(refused.code(), Code::NotFound);
     publish(&one, None, &walk, 0).await.expect("published");
     let before = site.contents();
-    assert_eq!(fetched(&reader.hatch, digest, content.len() as u64).await.expect("published"), content);
-    refreshed(&robot(), &reader.hatch, START).await;
+    assert_eq!(fetched(&reader.downloads, digest, content.len() as u64).await.expect("published"), content);
+    refreshed(&robot(), &reader.downloads, START).await;
     let page = |path: String, range: &'static str| {
         let get = Get::get(path).header("range", range).body(axum::body::Body::empty()).expect("a request");
         reader.pages().oneshot(get)
@@ -464,7 +465,7 @@ async fn what_is_withdrawn_by_others_is_handed_out_no_more_once_the_gateway_foll
     let document = midshift_bundle::repository::sign_targets(Some(&first), &[], &names, ends, &[&key]).expect("signed");
     opened(&one).repository.publish(Vec::new(), document, 1, Act::of_release(START)).await.expect("withdrawn");
     reader.documents.follow().await.expect("readable");
-    let refused = fetched(&reader.hatch, Digest::of(&walk[1].1), 1).await.expect_err("withdrawn");
+    let refused = fetched(&reader.downloads, Digest::of(&walk[1].1), 1).await.expect_err("withdrawn");
     assert_eq!(refused.code(), Code::NotFound);
 }
 
@@ -477,11 +478,11 @@ async fn a_gateway_tells_robots_of_the_patches_that_are_listed() {
     let release = [("gait-2.component".to_owned(), b"new".to_vec()), patch.clone()];
     publish(&one, None, &release, 0).await.expect("published");
     let reader = site.reader().await;
-    let answer = encoding(&reader.hatch, target, &[base]).await.expect("listed");
+    let answer = encoding(&reader.downloads, target, &[base]).await.expect("listed");
     assert_eq!((answer.encoding(), answer.base_digest), (v1::Encoding::ZstdPatch, base.to_string()));
     let digest = answer.encoded_digest.parse().expect("a digest");
-    assert_eq!(fetched(&reader.hatch, digest, answer.encoded_length).await.expect("there"), patch.1);
-    let answer = encoding(&reader.hatch, target, &[]).await.expect("listed");
+    assert_eq!(fetched(&reader.downloads, digest, answer.encoded_length).await.expect("there"), patch.1);
+    let answer = encoding(&reader.downloads, target, &[]).await.expect("listed");
     assert_eq!(answer.encoding(), v1::Encoding::Identity, "the whole of it has no shorter way");
 }
 

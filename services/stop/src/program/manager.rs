@@ -2,7 +2,7 @@
 //!
 //! Invariant: nobody waits for a manager; without one nothing is said.
 
-use crate::StopService;
+use crate::service::StopService;
 use std::env;
 use std::ffi::OsStr;
 use std::future::pending;

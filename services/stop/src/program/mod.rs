@@ -8,7 +8,11 @@ mod manager;
 mod next;
 mod principals;
 
-use crate::{Parts, StopService, port};
+pub use next::UP_WITHIN;
+
+use crate::inner::Parts;
+use crate::service::StopService;
+use crate::{folder, port};
 use anyhow::{Context, bail, ensure};
 use clap::Parser;
 use midshift_core::site::{Site, file};
@@ -27,8 +31,6 @@ use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
-/// A stop service that was started answers within this, or whoever has started it says that it did not.
-pub const UP_WITHIN: Duration = Duration::from_secs(10);
 /// How often one that follows looks whether the folder is free: nobody is answered meanwhile.
 const NEXT_EVERY: Duration = Duration::from_millis(10);
 
@@ -175,7 +177,7 @@ fn load_site(path: Option<&Path>) -> anyhow::Result<Arc<Site>> {
 /// Opens the folder as soon as the one before has let go of it, which it does when this one has read everything else.
 async fn following(parts: &Parts, shutdown: &CancellationToken) -> anyhow::Result<StopService> {
     // One that cannot read it would stop the whole fleet.
-    let latch = crate::latch(&parts.folder).context("reading the latch")?;
+    let latch = folder::latch(&parts.folder).context("reading the latch")?;
     ensure!(latch.is_some(), "there is no latch in {}", parts.folder.display());
     let mut waited = Duration::ZERO;
     loop {

@@ -3,20 +3,23 @@
 //! Both have the same open port, which the next one gets as its standard input: whoever dials between them waits a moment and is refused by nobody. Invariant:
 //! a next one that cannot begin costs nothing, this one goes on; two never have the folder at once.
 
-use super::{UP_WITHIN, manager};
-use crate::StopService;
+use super::manager;
+use crate::service::StopService;
 use anyhow::{Context, anyhow, bail, ensure};
 use std::env;
 use std::fs::File;
 use std::io::{self, Write};
 use std::os::fd::{AsFd, OwnedFd};
 use std::process::Stdio;
+use std::time::Duration;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpListener;
 use tokio::process::{Child, Command};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::time::timeout;
 
+/// A stop service that was started answers within this, or whoever has started it says that it did not.
+pub const UP_WITHIN: Duration = Duration::from_secs(10);
 /// What tells the next one that it is one.
 const FOLLOWS: &str = "--follows";
 /// What it says when it needs nothing more than the folder.

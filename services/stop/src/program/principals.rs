@@ -2,9 +2,9 @@
 //!
 //! Invariant: what cannot be read changes nothing; the last that could stays in force.
 
-use super::UP_WITHIN;
-use crate::Principals;
+use super::next::UP_WITHIN;
 use crate::port::{self, Followed};
+use crate::snapshot::Principals;
 use anyhow::{Context, bail};
 use midshift_core::identity::ServerProof;
 use midshift_core::site::Site;

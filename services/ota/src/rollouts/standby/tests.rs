@@ -94,7 +94,7 @@ impl World {
     async fn process_over(&self, store: Arc<dyn Store>) -> Process {
         let (folder, keys) = (self.dir.path().join("ota"), self.dir.path().join("keys"));
         let owner = Owner::Shared { store_id: self.store.id().clone(), known_bundles: 0 };
-        let ota = OtaParts { folder, keys, room: Room::of(1 << 20), clock: self.clock.clone(), owner };
+        let ota = OtaParts { folder, keys, room: Room::with_quota(1 << 20), clock: self.clock.clone(), owner };
         let ota = OtaService::open(ota).await.expect("a service");
         let shutdown = CancellationToken::new();
         let parts = Parts {

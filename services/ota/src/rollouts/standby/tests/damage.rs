@@ -14,13 +14,13 @@ async fn a_damaged_file_that_only_the_standby_has_read_is_told_once() {
     std::fs::write(path, vec![0; content.len()]).expect("damaged");
     let opened = standby.ota.opened().expect("keys");
     assert!(!*opened.leads.borrow(), "the other one leads");
-    assert!(opened.hatch.listed(digest).await.is_err(), "it is handed out to nobody");
+    assert!(opened.downloads.listed(digest).await.is_err(), "it is handed out to nobody");
     secs(5).await;
     let page = world.store.feed(Seq(0), &Log::ALL, 1_000).await.expect("a store");
     let names = digest.to_string();
     let is_told = |e: &&Entry| &*e.kind == INCIDENT && e.body.as_deref().is_some_and(|body| body.contains(&names));
     assert_eq!(page.entries.iter().filter(is_told).count(), 1);
-    assert!(opened.hatch.damaged().is_empty(), "and is forgotten once it is written");
+    assert!(opened.downloads.damaged().is_empty(), "and is forgotten once it is written");
     leader.end().await;
     standby.end().await;
 }

@@ -4,8 +4,8 @@
 //! the files: they are made by whoever signs. Bytes are for machines that are enrolled: a genuine certificate alone is none of a robot.
 
 use crate::content::{Content, Wanted};
-use crate::grpc::{answer, status};
 use crate::integrity::Integrity;
+use crate::refusal::{answer, status};
 use crate::repository::Documents;
 use midshift_bundle::digest::Digest;
 use midshift_core::identity::{Caller, RobotIdentity, Who};
@@ -14,15 +14,20 @@ use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_proto::access::caller;
 use midshift_proto::chunk;
 use midshift_proto::ota::v1;
-use midshift_proto::ota::v1::bundle_service_server::BundleService as BundleFace;
-use midshift_proto::ota::v1::chunk_service_server::ChunkService as ChunkFace;
+use midshift_proto::ota::v1::bundle_service_server::{BundleService as BundleFace, BundleServiceServer};
+use midshift_proto::ota::v1::chunk_service_server::{ChunkService as ChunkFace, ChunkServiceServer};
 use midshift_store::{Store, load};
 use std::collections::BTreeSet;
 use std::pin::Pin;
 use std::sync::Arc;
 use tokio_stream::{Stream, StreamExt};
 use tokio_util::io::ReaderStream;
+use tonic::codec::CompressionEncoding;
+use tonic::service::Routes;
 use tonic::{Request, Response, Status, Streaming};
+
+/// Longest message of the service: all documents of a publication.
+const MESSAGE_BYTES: usize = 2 * midshift_bundle::trust::METADATA_BYTES_MAX as usize;
 
 /// What is handed out.
 pub struct Shown {
@@ -31,9 +36,9 @@ pub struct Shown {
     integrity: Integrity,
 }
 
-/// The hatch. Cheap to clone. One of a server without keys says so to everybody.
+/// What may be downloaded, and by whom. Cheap to clone. One of a server without keys says so to everybody.
 #[derive(Clone, Default)]
-pub struct Hatch {
+pub struct Downloads {
     shown: Option<Arc<Shown>>,
     /// Rows that say which machines are robots. None: nobody is held against any.
     rows: Option<Arc<dyn Store>>,
@@ -46,7 +51,7 @@ impl Shown {
     }
 }
 
-impl Hatch {
+impl Downloads {
     pub(crate) fn new(content: Arc<dyn Content>, documents: Documents) -> Self {
         Self { shown: Some(Arc::new(Shown { content, documents, integrity: Integrity::default() })), rows: None }
     }
@@ -174,7 +179,7 @@ impl Hatch {
 
 /// What robots ask a gateway for of releases; all else is for the processes that keep them.
 #[tonic::async_trait]
-impl BundleFace for Hatch {
+impl BundleFace for Downloads {
     async fn get_metadata(
         &self,
         r: Request<v1::GetMetadataRequest>,
@@ -212,7 +217,7 @@ fn elsewhere<T>() -> Result<Response<T>, Status> {
 type Chunks = Pin<Box<dyn Stream<Item = Result<v1::FetchChunksResponse, Status>> + Send>>;
 
 #[tonic::async_trait]
-impl ChunkFace for Hatch {
+impl ChunkFace for Downloads {
     type FetchChunksStream = Chunks;
 
     async fn get_encoding(
@@ -227,6 +232,18 @@ impl ChunkFace for Hatch {
         let by = caller(&r);
         answer(self.fetch(r.into_inner(), &by).await)
     }
+}
+
+/// With the face of releases.
+pub fn add_bundles(face: impl BundleFace, routes: Routes) -> Routes {
+    let face = BundleServiceServer::new(face).accept_compressed(CompressionEncoding::Gzip);
+    routes.add_service(face.max_decoding_message_size(MESSAGE_BYTES))
+}
+
+/// With the face of bytes.
+pub fn add_chunks(downloads: Downloads, routes: Routes) -> Routes {
+    let face = ChunkServiceServer::new(downloads).accept_compressed(CompressionEncoding::Gzip);
+    routes.add_service(face.max_decoding_message_size(limits::CONTROL_MESSAGE_BYTES))
 }
 
 #[cfg(test)]

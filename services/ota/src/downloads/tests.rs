@@ -52,17 +52,17 @@ async fn bytes_are_given_to_machines_that_are_enrolled_and_to_no_other_with_a_ge
     let files = files("walk", "1.0.0");
     release(&service, &files).await;
     let service = service.with_rows(rows().await);
-    let (hatch, (name, content)) = (service.hatch(), &files[1]);
+    let (downloads, (name, content)) = (service.downloads(), &files[1]);
     let digest = Digest::of(content).to_string();
     let known = [machine("r1", 7), Caller::local()].map(|by| (by, None::<Code>, StatusCode::OK));
     let unknown = [machine("r1", 8), machine("r2", 7)];
     let unknown = unknown.map(|by| (by, Some(Code::RobotNotEnrolled), StatusCode::FORBIDDEN));
     for (by, refusal, status) in known.into_iter().chain(unknown) {
         let request = v1::GetEncodingRequest { digest: digest.clone(), ..Default::default() };
-        let answer = hatch.get_encoding(asked(&by, request)).await;
+        let answer = downloads.get_encoding(asked(&by, request)).await;
         assert_eq!(answer.err().as_ref().and_then(code), refusal, "{by}");
         let request = v1::FetchChunksRequest { digest: digest.clone(), offset: 0, length: 16 };
-        let answer = hatch.fetch_chunks(asked(&by, request)).await;
+        let answer = downloads.fetch_chunks(asked(&by, request)).await;
         assert_eq!(answer.err().as_ref().and_then(code), refusal, "{by}");
         let page = http::Request::builder().uri(format!("/targets/{digest}.{name}")).extension(by.clone());
         let page = service.pages().oneshot(page.body(Body::empty()).expect("a request")).await.expect("an answer");
