@@ -7,7 +7,7 @@
 //! 3. Tests that run at once have no port in common, also while a server of one is started again.
 //! 4. A test that does not end is ended with all that it started, and has failed.
 
-use crate::parts::{Count, Round, threads};
+use crate::round::{Count, Round, threads};
 use crate::run;
 use crate::workspace::Workspace;
 use anyhow::{Context, Result, bail, ensure};

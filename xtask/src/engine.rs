@@ -5,7 +5,7 @@
 //! twice there. Every night all tests run so.
 
 use crate::e2e::Way;
-use crate::parts::Scope;
+use crate::round::Scope;
 use crate::run;
 
 /// What the tests of the suite read; see tests/tests/e2e/engine.rs.

@@ -15,6 +15,7 @@ mod go;
 mod images;
 mod parts;
 mod quick;
+mod round;
 mod run;
 mod slowest;
 mod stack;

@@ -3,7 +3,7 @@
 //! Invariant: it proves nothing that the suite does not prove again.
 
 use crate::e2e::{self, Way};
-use crate::parts::{Count, Round};
+use crate::round::{Count, Round};
 use anyhow::Result;
 
 /// Shifts that are simulated: some five seconds a core.

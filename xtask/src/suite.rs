@@ -4,7 +4,8 @@
 //! `N passed, N failed` whenever tests ran.
 
 use crate::fetch_tools::Tools;
-use crate::parts::{Count, Part, Round, Scope};
+use crate::parts::Part;
+use crate::round::{Count, Round, Scope};
 use crate::run::{self, timed};
 use crate::workspace::Workspace;
 use crate::{deny, docker, sweep};

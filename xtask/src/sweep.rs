@@ -7,7 +7,8 @@
 //! `golden` in their name.
 
 use crate::fetch_tools::Tools;
-use crate::parts::{self, Count};
+use crate::parts;
+use crate::round::Count;
 use crate::run;
 use crate::workspace::Workspace;
 use anyhow::{Result, ensure};
