@@ -45,7 +45,7 @@ fn beside(programs: &[&Path]) -> anyhow::Result<PathBuf> {
 /// Refuses to begin beside a program that is missing or of another version.
 ///
 /// # Errors
-/// As of [`find`] and [`check_version`].
+/// It is missing, of another version, or does not say of which; it says what to do.
 pub async fn check_program() -> anyhow::Result<()> {
     check_version(&find()?).await
 }
