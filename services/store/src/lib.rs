@@ -1,8 +1,9 @@
 //! The one memory of midshift: rows changed by items under compare-and-set, and a feed of every change in commit order.
 //!
-//! Invariant: an item is applied whole or not at all, by the one service that owns its tables ([`Table::writer`]), and is
-//! acknowledged only once it is as durable as the store can make it. No decision about the fleet is made here.
-//! Called by the services through [`Store`]; [`MemoryStore`], [`SqliteStore`] and [`PostgresStore`] pass one contract suite (`tests/store/contract.rs`).
+//! Invariant: an item is applied whole or not at all, by the one service that owns its tables
+//! ([`midshift_core::rows::Table::writer`]), and is acknowledged only once it is as durable as the store can make it. No
+//! decision about the fleet is made here. Called by the services through [`Store`]; [`MemoryStore`], [`SqliteStore`] and
+//! [`PostgresStore`] pass one contract suite (`tests/store/contract.rs`).
 //!
 //! What is volatile (heartbeats, poses) is on the [`LiveBoard`], which several processes share through the [`HeardLog`]; what is bulky (samples) is in the [`FrameLog`]; neither is a row.
 
