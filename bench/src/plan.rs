@@ -3,7 +3,7 @@
 
 use crate::figure::{Figure, percentile};
 use crate::old_store::{self, OldArgs};
-use midshift_core::fleet::projection::{Rowed, View};
+use midshift_core::fleet::projection::{FleetProjection, Rowed};
 use midshift_core::fleet::{Board, Pace, Plan, Slice, cycle, found};
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::{Inventory, ReportedState, Vitals};
@@ -162,11 +162,11 @@ fn cycle_ms(site: &Arc<Site>, router: &Arc<Router>, kind: Fleet, robots: usize, 
     took
 }
 
-fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (View, Board) {
+fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (FleetProjection, Board) {
     let tasks = if kind == Fleet::Blocked { robots * BLOCKED_EACH } else { waiting(robots) };
     let not_before = (kind == Fleet::Blocked).then_some(Utc(now.utc.0 + 3_600_000));
     let battery_permille = if kind == Fleet::LowBattery { LOW_PERMILLE } else { 900 };
-    let mut view = View::new(site.clone(), Now::default(), Now::default());
+    let mut view = FleetProjection::new(site.clone(), Now::default(), Now::default());
     let mut board = Board::new();
     let mut x = seed.wrapping_mul(0x2545_f491_4f6c_dd1d) | 1;
     let mut draw = |below: usize| {
@@ -223,7 +223,7 @@ fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (
 }
 
 /// A row as the store has it.
-fn absorb(view: &mut View, record: &impl Record) {
+fn absorb(view: &mut FleetProjection, record: &impl Record) {
     let row = Row { key: record.key(), revision: Revision(1), index: record.index(), body: record.body() };
     view.absorb(&row.key, row.revision, Some(&row)).expect("a row of ours");
 }

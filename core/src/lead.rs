@@ -182,7 +182,7 @@ impl<R: LeaderRow> Seat<R> {
     pub fn follow(&mut self, entries: &[Entry], now: LinkTime) -> Result<(), BadRow> {
         let of_row = entries.iter().filter(|e| e.table == Some(R::TABLE));
         // An older one says only what the newest overtook.
-        let newest = of_row.max_by_key(|e| e.revision).and_then(|e| crate::picture::row_of(e, R::TABLE));
+        let newest = of_row.max_by_key(|e| e.revision).and_then(|e| crate::projection::row_of(e, R::TABLE));
         newest.map_or(Ok(()), |row| self.read(Some(&row), now))
     }
     /// What to do at `now`. Before the row was read nobody leads.

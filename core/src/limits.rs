@@ -285,7 +285,7 @@ pub const COMMAND_TRIES: u32 = 8;
 pub const LEAD_LEFT_WITHIN: LinkDuration = LinkDuration::from_secs(1);
 /// A leader that reads its rows says so long that it leads. What is alive is read in far less; whoever needs longer lets another one try.
 pub const LEAD_READS_FOR: LinkDuration = LinkDuration::from_secs(30);
-/// Rows of what is over that a picture asks for by id at once.
+/// Rows of what is over that a projection asks for by id at once.
 pub const ASKED_AT_ONCE: usize = 1_000;
 /// Open streams are cut this long after Ctrl-C.
 pub const HARD_DRAIN: LinkDuration = LinkDuration::from_secs(2);

@@ -3,8 +3,8 @@
 //! Called by what decides on commands in `fleet` and `rollout`. Invariant: the key is written in the item that carries the command out, so that
 //! neither stands without the other. What is answered to the second is that, and how things are by then.
 
-use crate::picture::{Picture, Slot, Tx, Viewed};
 use crate::privacy;
+use crate::projection::{Projected, Projection, Slot, Tx};
 use crate::reason::{Code, Kind, Reason, Refusal};
 use crate::rows::{Index, Record, Revision, Table, body_is_json};
 use crate::time::Utc;
@@ -79,9 +79,9 @@ pub fn is_repeat<C: Asked>(
 }
 
 /// Writes down that a command was carried out, and lets go of a few that are past their time.
-pub fn remember<P: Picture, C: Asked>(tx: &mut Tx<'_, P>, request_id: &str, command: &C, seen: Option<Revision>)
+pub fn remember<P: Projection, C: Asked>(tx: &mut Tx<'_, P>, request_id: &str, command: &C, seen: Option<Revision>)
 where
-    CommandKey<C>: Viewed<P>,
+    CommandKey<C>: Projected<P>,
 {
     let at_unix_ms = tx.now.wall.0;
     let oldest_ms = privacy::retention_of(C::KEYS).before(tx.now.steady_wall()).map_or(i64::MIN, |before| before.0);

@@ -1,7 +1,7 @@
 //! Keeps aside rows that hold a value of a newer version, such as a state that this build does not know.
 //!
-//! Called by [`crate::picture`] for every row that a picture takes. Invariants:
-//! 1. Such a row is not in the picture, and no decision that touches it reaches the store: it stays as the newer version wrote it.
+//! Called by [`crate::projection`] for every row that a projection takes. Invariants:
+//! 1. Such a row is not in the projection, and no decision that touches it reaches the store: it stays as the newer version wrote it.
 //! 2. What it is about is not acted on, and whoever asks is told the row and the value.
 //! 3. It is read anew whenever it changes.
 

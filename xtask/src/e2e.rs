@@ -1,12 +1,13 @@
-//! Runs end-to-end tests: each in a process of its own, the longest of the last run first, as many at once as there are permits.
+//! Runs end-to-end tests: each in a process of its own, the longest first, as many at once as the cores have time for.
 //!
 //! Invariants:
-//! 1. A test is started when it has its permits, in the order of the list, but for one small test beside heavy ones: what it waits for
-//!    them counts for none of its limits.
-//! 2. Split stacks, and what else starts many programs, take several permits, so that two of them at most run at once on two cores.
-//! 3. Tests that run at once have no port in common, also while a server of one is started again.
-//! 4. A test that does not end is ended with all that it started, and has failed.
+//! 1. A test is started in the order of the list: what it waits for its permits counts for none of its limits.
+//! 2. Split stacks, and what else starts many programs, take several permits, so that two of them at most run at once on two busy cores.
+//! 3. More permits than those of busy cores are given one test at a time, and only while the cores were idle for half of the last seconds.
+//! 4. Tests that run at once have no port in common, also while a server of one is started again.
+//! 5. A test that does not end is ended with all that it started, and has failed.
 
+use crate::cores::{Cores, WINDOW};
 use crate::round::{Count, Round, threads};
 use crate::run;
 use crate::workspace::Workspace;
@@ -18,12 +19,12 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::sync_channel;
+use std::sync::mpsc::{RecvTimeoutError, sync_channel};
 use std::time::Duration;
 
 /// The test program.
 pub const NAME: &str = "e2e";
-/// Modules (`name::`) and single tests that take more than one permit of two a core. With three there is room for one small test beside.
+/// Modules (`name::`) and single tests that take more than one permit of two a busy core.
 const HEAVY: &[(&str, usize)] = &[
     ("followed::", 2),
     ("handed_over::", 2),
@@ -105,16 +106,25 @@ impl Unit {
     }
 }
 
-/// The first in the queue, if so many permits are enough for it. Else a small one may overtake, unless one runs (`is_passed`): the
-/// first never waits for it, since none takes all permits but on one core.
-fn granted(queue: &mut VecDeque<Unit>, free: usize, is_passed: bool) -> Option<Unit> {
-    let fits = |unit: &Unit| unit.permits <= free;
-    let next = match queue.front() {
-        Some(first) if fits(first) => 0,
-        _ if is_passed => return None,
-        _ => queue.iter().position(|unit| unit.permits == 1 && fits(unit))?,
-    };
-    queue.remove(next)
+/// Permits of tests that run at once.
+#[derive(Clone, Copy)]
+struct Permits {
+    /// Those of busy cores.
+    busy: usize,
+    /// Those of idle ones.
+    idle: usize,
+}
+
+impl Permits {
+    fn new() -> Self {
+        Self { busy: threads(), idle: 3 * threads() }
+    }
+
+    /// The first in the queue, if it has its permits beside those that are used.
+    fn granted(self, queue: &mut VecDeque<Unit>, used: usize, cores: &mut impl FnMut() -> bool) -> Option<Unit> {
+        let needed = used + queue.front()?.permits;
+        (needed <= self.busy || needed <= self.idle && cores()).then(|| queue.pop_front())?
+    }
 }
 
 /// Plays them; whether all passed. Tests are added to `count`.
@@ -135,8 +145,13 @@ pub fn play(round: &Round<'_>, way: &Way<'_>, count: &mut Count) -> Result<bool>
                 }
             });
         }
-        let played =
-            all(queue, threads(), |unit, slot| round.one(unit, way, &program, &folder, ports(slot, threads())));
+        let (permits, mut cores) = (Permits::new(), Cores::new());
+        let played = all(
+            queue,
+            permits,
+            || cores.are_idle(),
+            |unit, slot| round.one(unit, way, &program, &folder, ports(slot, permits.idle)),
+        );
         stop.store(true, Ordering::Relaxed);
         played
     });
@@ -156,17 +171,16 @@ fn ports(slot: usize, slots: usize) -> Range<usize> {
 /// Starts each when it has its permits, in a slot that no other has meanwhile, and waits for all.
 fn all(
     mut queue: VecDeque<Unit>,
-    permits: usize,
+    permits: Permits,
+    mut are_cores_idle: impl FnMut() -> bool,
     one: impl Fn(&Unit, usize) -> Result<(bool, Count)> + Sync,
 ) -> Vec<Played> {
-    let (mut free, mut slots, mut played) = (permits, (0..permits).collect::<Vec<_>>(), Vec::new());
-    let mut small = 0;
-    let (ended, ends) = sync_channel::<Played>(permits);
+    let (mut used, mut slots, mut played) = (0, (0..permits.idle).collect::<Vec<_>>(), Vec::new());
+    let (ended, ends) = sync_channel::<Played>(permits.idle);
     std::thread::scope(|scope| {
         loop {
-            while let Some(unit) = granted(&mut queue, free, small > 0) {
-                free -= unit.permits;
-                small += usize::from(unit.permits == 1);
+            while let Some(unit) = permits.granted(&mut queue, used, &mut are_cores_idle) {
+                used += unit.permits;
                 // Each takes a permit at least.
                 let slot = slots.pop().unwrap_or_default();
                 let (ended, one) = (ended.clone(), &one);
@@ -176,12 +190,15 @@ fn all(
                     let _ = ended.send(Played { name: unit.name, permits: unit.permits, slot, took, outcome });
                 });
             }
-            if free == permits {
+            if used == 0 {
                 return;
             }
-            let Ok(one) = ends.recv() else { return };
-            free += one.permits;
-            small -= usize::from(one.permits == 1);
+            let one = match ends.recv_timeout(WINDOW) {
+                Ok(one) => one,
+                Err(RecvTimeoutError::Timeout) => continue,
+                Err(RecvTimeoutError::Disconnected) => return,
+            };
+            used -= one.permits;
             slots.push(one.slot);
             let word = if one.passed() { "ok" } else { "FAILED" };
             run::print(&format!("test {} ... {word} {:.1} s", one.name, one.took.as_secs_f64()));
@@ -339,7 +356,7 @@ pub fn in_sources() -> Vec<(String, String)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::sync::Mutex;
+    use std::sync::{Barrier, Mutex};
 
     fn queue(tests: &[&str], times: &[(&str, u64)], permits: usize) -> VecDeque<Unit> {
         let tests: Vec<String> = tests.iter().map(|test| (*test).to_owned()).collect();
@@ -363,25 +380,37 @@ mod tests {
     }
 
     #[test]
-    fn never_more_run_at_once_than_have_permits() {
+    fn never_more_run_at_once_than_have_permits_of_busy_or_of_idle_cores() {
         let tests =
             ["partition::a", "split::a", "split_held::a", "split_restored::a", "two_of_each::a", "x::a", "y::a"];
-        // Permits and slots of those that run at each moment at which one is started.
-        let (running, moments) = (Mutex::new(BTreeMap::new()), Mutex::new(Vec::new()));
-        let played = all(queue(&tests, &[], 4), 4, |unit, slot| {
-            let mut now = running.lock().unwrap();
-            let other: Option<usize> = now.insert(slot, unit.permits);
-            moments.lock().unwrap().push((other, now.values().copied().collect::<Vec<usize>>()));
-            drop(now);
-            std::thread::yield_now();
-            running.lock().unwrap().remove(&slot);
-            Ok((true, Count::default()))
-        });
-        let moments = moments.into_inner().unwrap();
-        assert_eq!((played.len(), moments.len()), (7, 7));
-        for (other, permits) in &moments {
-            let heavy = permits.iter().filter(|permits| **permits > 1).count();
-            assert!(other.is_none() && permits.iter().sum::<usize>() <= 4 && heavy <= 2, "{moments:?}");
+        let permits = Permits { busy: 4, idle: 12 };
+        for (idle, most) in [(false, 4), (true, 12)] {
+            // Permits and slots of those that run at each moment at which one is started.
+            let (running, moments) = (Mutex::new(BTreeMap::new()), Mutex::new(Vec::new()));
+            let all_run = Barrier::new(if idle { 5 } else { 1 });
+            let played = all(
+                queue(&tests, &[], 4),
+                permits,
+                || idle,
+                |unit, slot| {
+                    let mut now = running.lock().unwrap();
+                    let other: Option<usize> = now.insert(slot, unit.permits);
+                    moments.lock().unwrap().push((other, now.values().copied().collect::<Vec<usize>>()));
+                    drop(now);
+                    if unit.permits > 1 {
+                        all_run.wait();
+                    }
+                    running.lock().unwrap().remove(&slot);
+                    Ok((true, Count::default()))
+                },
+            );
+            let moments = moments.into_inner().unwrap();
+            assert_eq!((played.len(), moments.len()), (7, 7));
+            for (other, permits) in &moments {
+                let heavy = permits.iter().filter(|permits| **permits > 1).count();
+                assert!(other.is_none() && permits.iter().sum::<usize>() <= most, "{moments:?}");
+                assert!(idle || heavy <= 2, "{moments:?}");
+            }
         }
         let shares: Vec<_> = (0..3).map(|slot| ports(slot, 3)).collect();
         assert_eq!(shares, [12_000..18_666, 18_666..25_332, 25_332..31_998], "none has a port of another");
@@ -390,16 +419,24 @@ mod tests {
     }
 
     #[test]
-    fn one_small_test_runs_beside_heavy_ones_that_leave_it_room() {
+    fn none_overtakes_the_first_and_more_than_busy_cores_have_is_asked_of_idle_ones() {
         let mut order = queue(&["split::a", "split::b", "x::a", "y::a"], &[], 4);
-        let mut next = |free, is_passed| granted(&mut order, free, is_passed).map(|unit| unit.name);
-        let mut is = |free, is_passed, name: Option<&str>| assert_eq!(next(free, is_passed).as_deref(), name);
-        is(4, false, Some("split::a"));
-        is(1, false, Some("x::a"));
-        is(0, true, None);
-        is(1, false, Some("y::a"));
-        is(3, true, Some("split::b"));
-        is(4, false, None);
+        let (permits, mut asked) = (Permits { busy: 4, idle: 12 }, 0);
+        let mut is = |used, idle: bool, name: Option<&str>| {
+            let mut cores = || {
+                asked += 1;
+                idle
+            };
+            assert_eq!(permits.granted(&mut order, used, &mut cores).map(|unit| unit.name).as_deref(), name);
+            asked
+        };
+        assert_eq!(is(0, false, Some("split::a")), 0);
+        assert_eq!(is(3, false, None), 1, "a small one waits behind it");
+        assert_eq!(is(10, true, None), 1, "idle cores have no more than that either");
+        assert_eq!(is(3, true, Some("split::b")), 2);
+        assert_eq!(is(3, false, Some("x::a")), 2);
+        assert_eq!(is(4, true, Some("y::a")), 3);
+        assert_eq!(is(0, true, None), 3);
     }
 
     #[test]

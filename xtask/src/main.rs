@@ -5,6 +5,7 @@
 
 mod apt;
 mod clients;
+mod cores;
 mod deny;
 mod dist;
 mod docker;

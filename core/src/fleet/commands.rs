@@ -8,7 +8,7 @@ use crate::fleet::maintenance::drain;
 pub use crate::fleet::projection::command::Command;
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{Cordon, HolderState, Place, PlaceHolder, RobotControl};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::{arrivals, claims, load};
 use crate::identity::Caller;
 use crate::ids::{AttemptId, RobotId};
@@ -21,7 +21,13 @@ use crate::time::Now;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Checks a command against what is known; an error changes nothing.
-pub fn check(view: &View, board: &Board, now: &Now, command: &Command, seen: Option<Revision>) -> Result<(), Refusal> {
+pub fn check(
+    view: &FleetProjection,
+    board: &Board,
+    now: &Now,
+    command: &Command,
+    seen: Option<Revision>,
+) -> Result<(), Refusal> {
     let current = match command {
         Command::Cordon { robot_id, .. }
         | Command::Uncordon { robot_id }
@@ -129,7 +135,7 @@ fn clear(tx: &mut Tx, board: &Board, place: Place) {
 
 /// What people may say of a robot is what it may say of itself.
 fn may_label(
-    view: &View,
+    view: &FleetProjection,
     robot_id: &RobotId,
     labels: &BTreeMap<String, String>,
     removed: &BTreeSet<String>,
@@ -158,7 +164,13 @@ fn relabeled(
 
 /// An attempt is ignored only while its robot is heard, stands still, lists it as its own, and no row knows it: not right after it turned out to
 /// know more than a restored store.
-fn may_disown(view: &View, board: &Board, now: &Now, robot_id: &RobotId, attempt: &AttemptId) -> Result<(), Refusal> {
+fn may_disown(
+    view: &FleetProjection,
+    board: &Board,
+    now: &Now,
+    robot_id: &RobotId,
+    attempt: &AttemptId,
+) -> Result<(), Refusal> {
     let no = |what: &str| {
         let reason = Reason::new(Code::NotAllowedNow, what).with("robot_id", robot_id).with("attempt", attempt);
         Err(Refusal::new(Kind::Precondition, reason))
@@ -180,7 +192,7 @@ fn may_disown(view: &View, board: &Board, now: &Now, robot_id: &RobotId, attempt
 }
 
 /// What a command leaves in the audit.
-pub fn note(view: &View, command: &Command) -> Note {
+pub fn note(view: &FleetProjection, command: &Command) -> Note {
     let of_robot = |action, robot_id: &RobotId| Note::new(action).about("robot", robot_id);
     match command {
         Command::Cordon { robot_id, reason } => of_robot("robot.cordon", robot_id).because(reason),
@@ -218,7 +230,13 @@ pub fn note(view: &View, command: &Command) -> Note {
 }
 
 /// What a command that was refused leaves in the audit, if anything.
-pub fn refusal(view: &View, command: &Command, by: &Caller, request_id: Option<&str>, why: &Refusal) -> Option<Item> {
+pub fn refusal(
+    view: &FleetProjection,
+    command: &Command,
+    by: &Caller,
+    request_id: Option<&str>,
+    why: &Refusal,
+) -> Option<Item> {
     audit::refusal(Writer::Fleet, by, request_id, note(view, command), why)
 }
 

@@ -52,7 +52,7 @@ use explanation::{lasting, unexplained};
 use facts::{misreads, sweep};
 use maintenance::{budget, drain};
 use projection::rows::{RobotAuthority, RobotControl, RobotHolder, ServiceClock, SiteRow};
-use projection::state::View;
+use projection::state::FleetProjection;
 use tasks::arrivals;
 use traffic::{closures, desired, places};
 
@@ -66,7 +66,7 @@ pub fn rivals(is_shared: bool, bugs: bugs::Bugs) -> Rivals {
 }
 
 /// Rows every start makes sure of: the site, its places, and serving time.
-pub fn found(view: &mut View, now: Now, site_text: &str, map: &maps::MapChange, plan: &mut Plan) {
+pub fn found(view: &mut FleetProjection, now: Now, site_text: &str, map: &maps::MapChange, plan: &mut Plan) {
     maps::tell_of_change(view, now, map, plan);
     let site = view.site.clone();
     if view.sites.get(site.site_id().as_str()).is_some_and(|stored| stored.row.text != site_text) {
@@ -104,7 +104,7 @@ pub fn found(view: &mut View, now: Now, site_text: &str, map: &maps::MapChange, 
     view.policy_dirty.extend(all);
 }
 
-fn site_has(view: &View, place: &crate::site::Place) -> bool {
+fn site_has(view: &FleetProjection, place: &crate::site::Place) -> bool {
     let standing = place.waypoint().is_some();
     view.places
         .get(place.place_id.as_str())
@@ -122,7 +122,7 @@ pub enum Pace {
 
 /// One cycle over a view that has absorbed the whole feed. Items of earlier decisions of the cycle are already in `plan`. Each stage does as
 /// much as a slice holds, and leaves the rest for the next turn: then the report says `more`.
-pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Plan) {
+pub fn cycle(view: &mut FleetProjection, now: Now, board: &Board, pace: Pace, plan: &mut Plan) {
     view.screened.take();
     incidents::open_put_aside(view, now, plan);
     refusals::try_again(view);
@@ -169,7 +169,7 @@ pub fn cycle(view: &mut View, now: Now, board: &Board, pace: Pace, plan: &mut Pl
 }
 
 /// Robots that are new get their rows.
-fn welcome(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
+fn welcome(view: &mut FleetProjection, now: Now, board: &Board, plan: &mut Plan) {
     let new: Vec<RobotId> = board
         .keys()
         .filter(|r| view.sessions.contains_key(r.as_str()) && !view.authority.contains_key(r.as_str()))
@@ -191,7 +191,7 @@ fn welcome(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
 }
 
 /// Composes the desired state of every robot that something changed for; first of those that were just let go further.
-fn write_down(view: &mut View, now: Now, board: &Board, releases: &desired::Releases, plan: &mut Plan) {
+fn write_down(view: &mut FleetProjection, now: Now, board: &Board, releases: &desired::Releases, plan: &mut Plan) {
     let mut due = std::mem::take(&mut view.dirty);
     for robot_id in releases.0.keys() {
         due.remove(robot_id);
@@ -209,7 +209,7 @@ fn write_down(view: &mut View, now: Now, board: &Board, releases: &desired::Rele
 }
 
 /// Writes serving time and the consumed position with the items of this cycle, at most once a second.
-fn tell_time(view: &mut View, now: Now, plan: &mut Plan) {
+fn tell_time(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     let served = view.serving(&now);
     let written = view.clocks.get("fleet").map(|c| c.row).unwrap_or_default();
     if served.link_ms >= written.link_ms + 1_000 || written == ServiceClock::default() {

@@ -9,7 +9,7 @@ use super::facts::reports;
 use super::members::newcomers;
 use super::phases::advance;
 use super::projection::rows::{OtaClock, OtaMark, Phase, Rollout};
-use super::projection::state::View;
+use super::projection::state::RolloutProjection;
 use super::robots::machine::Move;
 use super::robots::{due, moves};
 use crate::fleet::Board;
@@ -26,7 +26,7 @@ const MOVES_PER_CYCLE: usize = 1_024;
 /// `plan`. `heard`: robots with a new heartbeat. `sign`: or why nothing can be signed that robots take; then roll-outs
 /// stand still, and nobody is told what would have to be signed. True: there is more to do at once.
 pub fn cycle(
-    view: &mut View,
+    view: &mut RolloutProjection,
     now: Now,
     board: &Board,
     heard: &BTreeSet<RobotId>,
@@ -47,7 +47,7 @@ pub fn cycle(
 
 /// What changed nothing when it was said is not heard again after a restart: by then it might change something. Written
 /// before the first decision that it came before.
-fn write_passed(view: &mut View, now: Now, first: usize, plan: &mut Plan) {
+fn write_passed(view: &mut RolloutProjection, now: Now, first: usize, plan: &mut Plan) {
     let passed = view.passed;
     if view.marks.get("ota").is_none_or(|m| m.row.seq < passed) {
         let mut tx = Tx::new(view, now, "ota");
@@ -60,7 +60,7 @@ fn write_passed(view: &mut View, now: Now, first: usize, plan: &mut Plan) {
 
 /// Everything but the service's own rows. True: there is more to do at once.
 fn plan_all(
-    view: &mut View,
+    view: &mut RolloutProjection,
     now: Now,
     board: &Board,
     heard: &BTreeSet<RobotId>,
@@ -100,7 +100,13 @@ fn plan_all(
 }
 
 /// Heartbeats that say what the rows do not.
-fn repair_from_heartbeats(view: &mut View, now: Now, board: &Board, heard: &BTreeSet<RobotId>, plan: &mut Plan) {
+fn repair_from_heartbeats(
+    view: &mut RolloutProjection,
+    now: Now,
+    board: &Board,
+    heard: &BTreeSet<RobotId>,
+    plan: &mut Plan,
+) {
     for robot_id in heard {
         if let Some(live) = board.get(robot_id)
             && view.is_settled(live)
@@ -112,7 +118,7 @@ fn repair_from_heartbeats(view: &mut View, now: Now, board: &Board, heard: &BTre
 }
 
 /// Robots that came since: whoever should have had a part in a completed roll-out gets one.
-fn add_newcomers(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
+fn add_newcomers(view: &mut RolloutProjection, now: Now, board: &Board, plan: &mut Plan) {
     if view.area_bundles.is_empty() {
         return;
     }
@@ -130,7 +136,7 @@ fn add_newcomers(view: &mut View, now: Now, board: &Board, plan: &mut Plan) {
 }
 
 /// Ids of robots' rows that something may be due for, by roll-out, wave and place.
-fn due_robots(view: &View) -> Vec<String> {
+fn due_robots(view: &RolloutProjection) -> Vec<String> {
     let mut ids = view.open.clone();
     let whole = |r: &&Rollout| {
         matches!(r.phase, Phase::Aborting | Phase::RollingBack) || (r.second_pass && r.phase == Phase::Applying)
@@ -156,7 +162,7 @@ const CONSUMED_MAX: u64 = 10_000;
 
 /// Writes serving time and the consumed position, at most once a second, with something else or when there was much to
 /// consume.
-fn write_time(view: &mut View, now: Now, plan: &mut Plan) {
+fn write_time(view: &mut RolloutProjection, now: Now, plan: &mut Plan) {
     let clock = view.clocks.get("ota").map(|c| c.row).unwrap_or_default();
     let consumed = view.marks.get("ota").map_or(Seq(0), |m| m.row.seq);
     if plan.items.is_empty() && view.absorbed.0.saturating_sub(consumed.0) < CONSUMED_MAX {

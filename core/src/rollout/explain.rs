@@ -12,7 +12,7 @@ use crate::robot::Presence;
 use crate::rollout::judgement::infrastructure;
 use crate::rollout::projection::queue;
 use crate::rollout::projection::rows::{Countdown, Phase, Rollout, RolloutRobot, Step};
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use crate::rollout::robots::{due, moves};
 use crate::time::{Now, Utc};
 use crate::update::UpdateState;
@@ -32,14 +32,20 @@ pub struct Blocked {
 }
 
 /// What `r` waits for; none: nothing is left to do.
-pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
+pub fn blocked(
+    view: &RolloutProjection,
+    board: &Board,
+    now: &Now,
+    rollout: &Rollout,
+    r: &RolloutRobot,
+) -> Option<Blocked> {
     let waits = silent(view, board, now, rollout, r).or_else(|| waits_for(view, board, now, rollout, r))?;
     let by = name_robots(view, board, now, rollout, waits.by);
     Some(Blocked { by, deadline: waits.deadline.filter(|deadline| *deadline > now.utc), ..waits })
 }
 
 /// A robot that is out of work and is not heard waits for nothing else: since when, and until when nobody is told.
-fn silent(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
+fn silent(view: &RolloutProjection, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
     r.drain_id.as_ref().filter(|id| view.drain(id).is_some_and(Drain::is_on))?;
     if liveness::presence(board, &r.robot_id, now) != Presence::Offline {
         return None;
@@ -53,7 +59,7 @@ fn silent(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutR
 }
 
 /// A reason that waits for room, with the robots that have it now.
-fn name_robots(view: &View, board: &Board, now: &Now, rollout: &Rollout, by: Reason) -> Reason {
+fn name_robots(view: &RolloutProjection, board: &Board, now: &Now, rollout: &Rollout, by: Reason) -> Reason {
     let of_rollout = |r: &&RolloutRobot| r.drain_id.is_some() && r.counts();
     let robots: Vec<&RobotId> = match by.code {
         Code::BlockedByBudget => {
@@ -84,7 +90,13 @@ fn name_robots(view: &View, board: &Board, now: &Now, rollout: &Rollout, by: Rea
     told
 }
 
-fn waits_for(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Blocked> {
+fn waits_for(
+    view: &RolloutProjection,
+    board: &Board,
+    now: &Now,
+    rollout: &Rollout,
+    r: &RolloutRobot,
+) -> Option<Blocked> {
     let mut since = r.since;
     let mut deadline = None;
     if let Some(by) = moves::why_unsigned(view, r)
@@ -148,7 +160,7 @@ fn waits_for(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &Rollo
 }
 
 /// A reason that waits for a wave names robots of the present one that are not decided.
-fn name_wave(view: &View, rollout: &Rollout, by: Reason) -> Reason {
+fn name_wave(view: &RolloutProjection, rollout: &Rollout, by: Reason) -> Reason {
     if by.code != Code::BlockedByWave {
         return by;
     }

@@ -148,7 +148,7 @@ mod tests {
     fn said(items: &[Item]) -> Vec<(String, String, Option<bool>)> {
         let row = |item: &Item| {
             let change = &item.rows[0];
-            let record = crate::picture::written::<StopRecord>(item);
+            let record = crate::projection::written::<StopRecord>(item);
             (change.key.id.to_string(), item.actor.to_string(), record.map(|record| record.is_effective()))
         };
         items.iter().map(row).collect()
@@ -189,7 +189,7 @@ mod tests {
         known.reset(Reset { token_id: token_id.clone(), ..reset("S1") });
         let items = copy(&known, &BTreeMap::new());
         assert!(items.len() == 2 && items.iter().all(|item| item.token == token_id), "{items:?}");
-        let record = crate::picture::written::<StopRecord>(&items[1]).expect("a record");
+        let record = crate::projection::written::<StopRecord>(&items[1]).expect("a record");
         let copied = BTreeMap::from([(record.stop.stop_id.clone(), (record, Revision(2)))]);
         assert_eq!(copy(&latch(&["S1"], &["S1"]), &copied), [], "a robot brought it back: it is the same");
     }

@@ -10,9 +10,9 @@ use crate::denials::Denials;
 use crate::frame_heads::{Counted, Flooded};
 use crate::listen::Io;
 use crate::peer::{ConnectionId, Denied, Peer, Principals};
+use crate::quota::network;
 use crate::requests::{Door, Rules, Services};
-use crate::seats::network;
-use crate::stranger::Stranger;
+use crate::unauthenticated::Unauthenticated;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto;
 use midshift_core::limits;
@@ -122,11 +122,11 @@ impl Port {
         self: Arc<Self>,
         io: Box<dyn Io>,
         address: SocketAddr,
-        (id, stranger): (ConnectionId, Stranger),
+        (id, unauthenticated): (ConnectionId, Unauthenticated),
         stop: CancellationToken,
     ) -> End {
         let Some(tls) = &self.tls else {
-            return self.serve(io, Peer::new(address, None, id), stranger, stop).await;
+            return self.serve(io, Peer::new(address, None, id), unauthenticated, stop).await;
         };
         // What is newest now; a connection keeps it.
         let acceptor = TlsAcceptor::from(tls.borrow().clone());
@@ -148,10 +148,16 @@ impl Port {
         };
         let shown = io.get_ref().1.peer_certificates().and_then(<[_]>::first);
         let leaf = shown.map(|leaf| leaf.clone().into_owned());
-        self.serve(Box::new(io), Peer::new(address, leaf, id), stranger, stop).await
+        self.serve(Box::new(io), Peer::new(address, leaf, id), unauthenticated, stop).await
     }
 
-    async fn serve(&self, io: Box<dyn Io>, peer: Peer, stranger: Stranger, stop: CancellationToken) -> End {
+    async fn serve(
+        &self,
+        io: Box<dyn Io>,
+        peer: Peer,
+        unauthenticated: Unauthenticated,
+        stop: CancellationToken,
+    ) -> End {
         // Before asking, so that no change falls in between.
         let mut changed = self.principals.changed();
         let activity = Activity::new();
@@ -160,7 +166,7 @@ impl Port {
             rules: self.rules.clone(),
             activity: activity.clone(),
             peer: peer.clone(),
-            stranger: stranger.clone(),
+            unauthenticated: unauthenticated.clone(),
             principals: self.principals.clone(),
             denials: self.denials.clone(),
             batches: Arc::new(Semaphore::new(limits::BATCHES_PER_CONNECTION_MAX)),
@@ -169,7 +175,7 @@ impl Port {
             return self.turn_away(io, door, denied).await;
         }
         if peer.certificate.is_some() {
-            stranger.is_known();
+            unauthenticated.set_authenticated();
         }
         let flooded = Flooded::default();
         let io = TokioIo::new(Counted::new(io, flooded.clone()));

@@ -3,7 +3,7 @@
 //! Invariant: nothing waits for it. What is handed over is limited, for each caller and for all, so that no flood of refusals fills a disk; what was left
 //! out is counted, and the count goes with the next one that is not.
 
-use crate::asker::Asker;
+use crate::quota_key::QuotaKey;
 use crate::rates::{Bucket, Rates};
 use midshift_core::identity::Actor;
 use midshift_core::limits;
@@ -36,7 +36,7 @@ pub struct Denial {
 pub struct Denials {
     port: &'static str,
     sink: mpsc::Sender<Denial>,
-    each: Rates<Asker>,
+    each: Rates<QuotaKey>,
     all: Rates<()>,
     left_out: AtomicU64,
 }
@@ -55,15 +55,15 @@ impl Denials {
         (Self { port, sink, each, all, left_out: AtomicU64::new(0) }, told)
     }
 
-    /// Whether one more of this asker may leave a trace. It counts as one that did.
-    fn is_fit(&self, asker: &Asker) -> bool {
+    /// Whether one more of this key may leave a trace. It counts as one that did.
+    fn is_fit(&self, key: &QuotaKey) -> bool {
         let now = Instant::now();
-        self.each.admit(asker, now, Class::Stop) && self.all.admit(&(), now, Class::Stop)
+        self.each.admit(key, now, Class::Stop) && self.all.admit(&(), now, Class::Stop)
     }
 
-    /// Hands it over, if one more of this asker may leave a trace.
-    pub(crate) fn report(&self, asker: &Asker, actor: Actor, network: IpAddr, path: &str, reason: &Reason) {
-        let Some(place) = self.is_fit(asker).then(|| self.sink.try_reserve().ok()).flatten() else {
+    /// Hands it over, if one more of this key may leave a trace.
+    pub(crate) fn report(&self, key: &QuotaKey, actor: Actor, network: IpAddr, path: &str, reason: &Reason) {
+        let Some(place) = self.is_fit(key).then(|| self.sink.try_reserve().ok()).flatten() else {
             self.left_out.fetch_add(1, Relaxed);
             metrics::counter!("midshift_edge_denials_left_out_total", "port" => self.port).increment(1);
             return;

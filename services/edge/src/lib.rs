@@ -11,28 +11,28 @@
 mod accept;
 mod activity;
 mod answer;
-mod asker;
 mod config;
 mod connection;
 mod deadline;
 mod denials;
+mod descriptor_budget;
 mod frame_heads;
-mod known;
 mod listen;
 mod peer;
+mod principals;
+mod quota;
+mod quota_key;
 mod rates;
 mod requests;
-mod room;
-mod seats;
-mod stranger;
 pub mod tls;
+mod unauthenticated;
 
 pub use config::{Age, Config, Rate};
 pub use denials::{Denial, Denials};
-pub use known::{Known, robot_of, serial_of};
+pub use descriptor_budget::{TooFew, connections_max};
 pub use listen::{Incoming, Listen, Listener};
 pub use peer::{Anybody, ConnectionId, Denied, Peer, Principals};
-pub use room::{TooFew, connections_max};
+pub use principals::{SitePrincipals, robot_of, serial_of};
 
 use accept::Accept;
 use config::std;
@@ -40,19 +40,19 @@ use connection::{End, Port};
 use http::{Request, Response};
 use midshift_core::overload::Class;
 use midshift_core::{Boxed, limits};
+use quota::{Full, Quota, Slot, network};
 use requests::{Rules, Services};
 use rustls::ServerConfig;
-use seats::{Full, Seat, Seats, network};
 use std::convert::Infallible;
 use std::net::IpAddr;
 use std::sync::Arc;
-use stranger::Stranger;
 use tokio::sync::watch;
 use tokio::task::{JoinError, JoinSet};
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 use tonic::body::Body;
 use tower::{Service, ServiceExt};
+use unauthenticated::Unauthenticated;
 
 /// One port: its services and its limits.
 pub struct Edge {
@@ -124,13 +124,13 @@ impl Edge {
             };
             let Some((io, address)) = accepted else { break };
             match places.claim(network(address.ip())) {
-                Ok((seat, stranger)) => {
+                Ok((slot, unauthenticated)) => {
                     last += 1;
-                    let who = (ConnectionId(last), stranger);
+                    let who = (ConnectionId(last), unauthenticated);
                     let connection = shared.clone().run(io, address, who, leave.clone());
                     connections.spawn(async move {
                         let end = connection.await;
-                        drop(seat);
+                        drop(slot);
                         end
                     });
                     gauge.set(connections.len() as f64);
@@ -161,31 +161,31 @@ impl Edge {
 }
 
 /// Places of connections: of all, and, where there is a login, of those that have not shown yet who they are. One network has the same part of what the others
-/// leave among strangers as it may have of all.
+/// leave of the unauthenticated as it may have of all.
 struct Places {
-    all: Arc<Seats<IpAddr>>,
-    strangers: Option<Arc<Seats<IpAddr>>>,
+    all: Arc<Quota<IpAddr>>,
+    unauthenticated: Option<Arc<Quota<IpAddr>>>,
 }
 
 impl Places {
     fn new(config: &Config, has_login: bool) -> Self {
         let (all, each) = (config.connections_max, config.connections_per_network_max);
-        let strangers = (all / limits::STRANGERS_PART).max(1);
-        Self { all: Seats::new(all, each), strangers: has_login.then(|| Seats::sharing(strangers, each, all)) }
+        let most = (all / limits::STRANGERS_PART).max(1);
+        Self { all: Quota::new(all, each), unauthenticated: has_login.then(|| Quota::sharing(most, each, all)) }
     }
 
     /// One of each, or what is full, as metrics name it.
-    fn claim(&self, network: IpAddr) -> Result<(Seat<IpAddr>, Stranger), &'static str> {
-        let seat = self.all.claim(network, Class::Stop).map_err(|full| match full {
+    fn claim(&self, network: IpAddr) -> Result<(Slot<IpAddr>, Unauthenticated), &'static str> {
+        let slot = self.all.claim(network, Class::Stop).map_err(|full| match full {
             Full::Total => "connections_max",
             Full::Kind => "connections_per_network_max",
         })?;
-        let stranger = self.strangers.as_ref().map(|strangers| strangers.claim(network, Class::Stop)).transpose();
-        let stranger = stranger.map_err(|full| match full {
+        let unauthenticated = self.unauthenticated.as_ref().map(|quota| quota.claim(network, Class::Stop)).transpose();
+        let unauthenticated = unauthenticated.map_err(|full| match full {
             Full::Total => "strangers_max",
             Full::Kind => "strangers_per_network_max",
         })?;
-        Ok((seat, Stranger::new(stranger)))
+        Ok((slot, Unauthenticated::new(unauthenticated)))
     }
 }
 

@@ -5,14 +5,14 @@
 
 use crate::activity::{Activity, OpenStream};
 use crate::answer::Speech;
-use crate::asker::Asker;
 use crate::config::{Config, std};
 use crate::deadline::{self, Bounded, Over};
 use crate::denials::{self, Denials};
 use crate::peer::{Peer, Principals};
+use crate::quota::{Full, Quota, Slot, network};
+use crate::quota_key::QuotaKey;
 use crate::rates::Rates;
-use crate::seats::{Full, Seat, Seats, network};
-use crate::stranger::Stranger;
+use crate::unauthenticated::Unauthenticated;
 use http::{HeaderMap, Request, Response, Uri};
 use hyper::body::Incoming;
 use hyper::service::Service as HyperService;
@@ -35,11 +35,11 @@ use tonic::body::Body;
 pub(crate) struct Rules {
     port: &'static str,
     head: Duration,
-    rates: Rates<Asker>,
-    seats: Arc<Seats<Asker>>,
+    rates: Rates<QuotaKey>,
+    slots: Arc<Quota<QuotaKey>>,
     /// Of all these, those of whoever has not shown who it is.
-    strangers: Arc<Seats<Asker>>,
-    watches: Arc<Seats<Asker>>,
+    unauthenticated: Arc<Quota<QuotaKey>>,
+    watches: Arc<Quota<QuotaKey>>,
     /// Requests under way.
     gauge: metrics::Gauge,
     bugs: Bugs,
@@ -48,45 +48,46 @@ pub(crate) struct Rules {
 impl Rules {
     pub fn new(config: &Config) -> Self {
         let (all, each) = (config.requests_max, config.requests_per_principal_max);
-        let strangers = (all / limits::STRANGERS_PART).clamp(1, limits::STRANGER_REQUESTS_MAX);
+        let most = (all / limits::STRANGERS_PART).clamp(1, limits::STRANGER_REQUESTS_MAX);
         Self {
             port: config.port,
             head: std(config.head),
             rates: Rates::new(config.rate, config.rates_remembered),
-            seats: Seats::new(all, each),
-            strangers: Seats::sharing(strangers, each, all),
-            watches: Seats::new(config.watches_max, config.watches_per_principal_max),
+            slots: Quota::new(all, each),
+            unauthenticated: Quota::sharing(most, each, all),
+            watches: Quota::new(config.watches_max, config.watches_per_principal_max),
             gauge: metrics::gauge!("midshift_edge_requests", "port" => config.port),
             bugs: config.bugs,
         }
     }
 
-    /// Its seat and its caller's own deadline, or why it goes no further.
-    fn admit(&self, asker: &Asker, path: &str, headers: &HeaderMap, speech: &Speech) -> Result<Admitted, Refusal> {
+    /// Its slot and its caller's own deadline, or why it goes no further.
+    fn admit(&self, key: &QuotaKey, path: &str, headers: &HeaderMap, speech: &Speech) -> Result<Admitted, Refusal> {
         let (class, now) = (access::class(path).with(self.bugs), Instant::now());
-        if !self.rates.admit(asker, now, class) {
+        if !self.rates.admit(key, now, class) {
             return Err(Refusal::new(Kind::Exhausted, Code::TooManyRequests));
         }
-        let stranger = match asker {
-            Asker::Stranger(_) => self.strangers.claim(asker.clone(), class).map(Some),
+        let unauthenticated = match key {
+            QuotaKey::Unauthenticated(_) => self.unauthenticated.claim(key.clone(), class).map(Some),
             _ => Ok(None),
         };
-        let seat = stranger.and_then(|stranger| Ok((self.seats.claim(asker.clone(), class)?, stranger)));
-        let seats = seat.map_err(|full| refused(full, "requests are under way"))?;
-        // None goes before another: each may have the last seat.
-        let watch = access::is_watch(path).then(|| self.watches.claim(asker.clone(), Class::Stop)).transpose();
+        let slot =
+            unauthenticated.and_then(|unauthenticated| Ok((self.slots.claim(key.clone(), class)?, unauthenticated)));
+        let slots = slot.map_err(|full| refused(full, "requests are under way"))?;
+        // None goes before another: each may have the last slot.
+        let watch = access::is_watch(path).then(|| self.watches.claim(key.clone(), Class::Stop)).transpose();
         let watch = watch.map_err(|full| refused(full, "watches go on"))?;
         if self.bugs.seats_are_kept() {
-            std::mem::forget(self.seats.claim(asker.clone(), Class::Stop));
+            std::mem::forget(self.slots.claim(key.clone(), Class::Stop));
         }
-        let seat = Inside::new(&self.gauge, seats, watch);
+        let slot = Inside::new(&self.gauge, slots, watch);
         let given = if *speech == Speech::Http { None } else { deadline::given(headers)? };
         // A time that no clock reaches is none.
-        Ok(Admitted { seat, deadline: given.and_then(|given| now.checked_add(given)) })
+        Ok(Admitted { slot, deadline: given.and_then(|given| now.checked_add(given)) })
     }
 }
 
-/// No room, as this asker's share or the port's is used up.
+/// No room, as this key's share or the port's is used up.
 fn refused(full: Full, what: &str) -> Refusal {
     let reason = match full {
         Full::Kind => Reason::new(Code::TooManyRequests, format!("as many {what} as one caller has room for here")),
@@ -96,26 +97,30 @@ fn refused(full: Full, what: &str) -> Refusal {
 }
 
 struct Admitted {
-    seat: Inside,
+    slot: Inside,
     deadline: Option<Instant>,
 }
 
 /// What an answer keeps until its body is gone. Fields are never read.
 type Held = (OpenStream, Option<Inside>);
 
-/// One request under way, with its seat among all, and among strangers.
+/// One request under way, with its slot among all, and among those of unauthenticated callers.
 pub(crate) struct Inside {
     gauge: metrics::Gauge,
-    _seats: (Seat<Asker>, Option<Seat<Asker>>),
-    _watch: Option<Seat<Asker>>,
+    _slots: (Slot<QuotaKey>, Option<Slot<QuotaKey>>),
+    _watch: Option<Slot<QuotaKey>>,
     /// Its place among the batches of its connection. Never read.
     batch: Option<OwnedSemaphorePermit>,
 }
 
 impl Inside {
-    fn new(gauge: &metrics::Gauge, seats: (Seat<Asker>, Option<Seat<Asker>>), watch: Option<Seat<Asker>>) -> Self {
+    fn new(
+        gauge: &metrics::Gauge,
+        slots: (Slot<QuotaKey>, Option<Slot<QuotaKey>>),
+        watch: Option<Slot<QuotaKey>>,
+    ) -> Self {
         gauge.increment(1.0);
-        Self { gauge: gauge.clone(), _seats: seats, _watch: watch, batch: None }
+        Self { gauge: gauge.clone(), _slots: slots, _watch: watch, batch: None }
     }
 }
 
@@ -134,7 +139,7 @@ pub(crate) struct Door {
     pub rules: Arc<Rules>,
     pub activity: Activity,
     pub peer: Peer,
-    pub stranger: Stranger,
+    pub unauthenticated: Unauthenticated,
     pub principals: Arc<dyn Principals>,
     pub denials: Option<Arc<Denials>>,
     /// Room for batches of this connection.
@@ -159,59 +164,59 @@ impl Door {
     fn admit(&self, request: &Request<Incoming>, speech: &Speech) -> Result<(Caller, Admitted), Refusal> {
         let (path, headers) = (request.uri().path(), request.headers());
         let caller = self.principals.caller(&self.peer, headers);
-        let asker = Asker::from_caller(caller.as_ref(), self.peer.address.ip());
-        if !matches!(asker, Asker::Stranger(_)) {
-            self.stranger.is_known();
+        let key = QuotaKey::from_caller(caller.as_ref(), self.peer.address.ip());
+        if !matches!(key, QuotaKey::Unauthenticated(_)) {
+            self.unauthenticated.set_authenticated();
         }
         // Before anything else is said: guessing is limited too.
-        let admitted = self.rules.admit(&asker, path, headers, speech);
+        let admitted = self.rules.admit(&key, path, headers, speech);
         let mut admitted = admitted.inspect_err(|refusal| {
             let (port, code) = (self.rules.port, refusal.reason.code);
-            tracing::info!(port, peer = %asker, path = denials::cut(path), %code, "a request was refused");
+            tracing::info!(port, peer = %key, path = denials::cut(path), %code, "a request was refused");
         })?;
         let allowed = match &caller {
             Ok(caller) => access::check(caller, path),
             Err(worthless) => Err(worthless.clone()),
         };
         if let Err(refusal) = &allowed {
-            self.denied(&asker, caller.as_ref().ok(), path, refusal);
+            self.denied(&key, caller.as_ref().ok(), path, refusal);
         }
         allowed?;
-        admitted.seat.batch = self.batch(path)?;
+        admitted.slot.batch = self.batch(path)?;
         Ok((caller?, admitted))
     }
 
     /// Tells whoever writes it down. Somebody who showed nothing was denied nothing: it is asked to sign in.
-    fn denied(&self, asker: &Asker, caller: Option<&Caller>, path: &str, refusal: &Refusal) {
+    fn denied(&self, key: &QuotaKey, caller: Option<&Caller>, path: &str, refusal: &Refusal) {
         if caller.is_some_and(|caller| matches!(caller.who(), Who::Nobody)) {
             return;
         }
         let (actor, from) = (Actor::from(caller.unwrap_or(&Caller::nobody())), network(self.peer.address.ip()));
-        report_denial(self.rules.port, self.denials.as_deref(), asker, actor, from, path, refusal);
+        report_denial(self.rules.port, self.denials.as_deref(), key, actor, from, path, refusal);
     }
 
     /// For a service that denies what only it can judge.
     fn denying(&self, caller: &Caller, uri: &Uri) -> Denying {
         let Some(denials) = self.denials.clone() else { return Denying::default() };
-        let asker = Asker::from_caller(Ok(caller), self.peer.address.ip());
+        let key = QuotaKey::from_caller(Ok(caller), self.peer.address.ip());
         let (port, from, caller) = (self.rules.port, network(self.peer.address.ip()), caller.clone());
-        Denying::new(Arc::new(Inward { port, denials, asker, caller, from, uri: uri.clone() }))
+        Denying::new(Arc::new(Inward { port, denials, key, caller, from, uri: uri.clone() }))
     }
 }
 
 fn report_denial(
     port: &'static str,
     denials: Option<&Denials>,
-    asker: &Asker,
+    key: &QuotaKey,
     actor: Actor,
     from: IpAddr,
     path: &str,
     refusal: &Refusal,
 ) {
     let (code, path) = (refusal.reason.code, denials::cut(path));
-    tracing::info!(port, peer = %asker, %actor, path, %code, "a request was denied");
+    tracing::info!(port, peer = %key, %actor, path, %code, "a request was denied");
     if let Some(denials) = denials {
-        denials.report(asker, actor, from, path, &refusal.reason);
+        denials.report(key, actor, from, path, &refusal.reason);
     }
 }
 
@@ -219,7 +224,7 @@ fn report_denial(
 struct Inward {
     port: &'static str,
     denials: Arc<Denials>,
-    asker: Asker,
+    key: QuotaKey,
     caller: Caller,
     from: IpAddr,
     uri: Uri,
@@ -231,7 +236,7 @@ impl Told for Inward {
         metrics::counter!("midshift_edge_requests_denied_inside_total", "port" => port, "reason" => reason)
             .increment(1);
         let actor = Actor::from(&self.caller);
-        report_denial(port, Some(&*self.denials), &self.asker, actor, self.from, self.uri.path(), refusal);
+        report_denial(port, Some(&*self.denials), &self.key, actor, self.from, self.uri.path(), refusal);
     }
 }
 
@@ -244,7 +249,7 @@ impl HyperService<Request<Incoming>> for Door {
         let (stream, now) = (self.activity.begin(), Instant::now());
         let over = Over::new(&self.peer);
         let speech = Speech::from_headers(request.headers());
-        let (caller, Admitted { seat, deadline }) = match self.admit(&request, &speech) {
+        let (caller, Admitted { slot, deadline }) = match self.admit(&request, &speech) {
             Ok(admitted) => admitted,
             Err(refusal) => {
                 let (port, reason) = (self.rules.port, refusal.reason.code.as_str());
@@ -265,10 +270,10 @@ impl HyperService<Request<Incoming>> for Door {
         Box::pin(async move {
             let Ok(response) = timeout_at(head, answer).await else {
                 let late = speech.refuse(&deadline::over());
-                return Ok(late.map(|body| Bounded::new(body, None, over, speech, (stream, Some(seat)))));
+                return Ok(late.map(|body| Bounded::new(body, None, over, speech, (stream, Some(slot)))));
             };
             let response = speech.reasoned(response);
-            Ok(response.map(|body| Bounded::new(body, deadline, over, speech, (stream, Some(seat)))))
+            Ok(response.map(|body| Bounded::new(body, deadline, over, speech, (stream, Some(slot)))))
         })
     }
 }

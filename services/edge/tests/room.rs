@@ -6,7 +6,7 @@ use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::time::{Clock, LinkDuration, ScaledClock, Utc};
 use midshift_edge::tls::{Clients, server_config};
-use midshift_edge::{Config, Edge, Known, connections_max};
+use midshift_edge::{Config, Edge, SitePrincipals, connections_max};
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair, SanType};
 use rustix::process::{Resource, Rlimit, setrlimit};
 use rustls::crypto::aws_lc_rs;
@@ -89,7 +89,7 @@ async fn a_robot_is_served_while_a_thousand_silent_peers_want_every_descriptor()
         tls_handshake: LinkDuration::from_secs(600),
         ..Config::default()
     };
-    let known = Arc::new(Known::new(SiteId::parse("factory").expect("a site"), clock));
+    let known = Arc::new(SitePrincipals::new(SiteId::parse("factory").expect("a site"), clock));
     let services =
         tower::service_fn(async |_: http::Request<Body>| Ok::<_, Infallible>(http::Response::new(Body::empty())));
     let listener = TcpListener::bind(("127.0.0.1", 0)).await.expect("a port");

@@ -3,14 +3,14 @@
 //! Invariants:
 //! 1. What the store refuses for good costs that one decision and those made on top of it: their rows are read again, and no others.
 //! 2. A command whose rows others have changed meanwhile is decided anew, as it is by a process that does not lead.
-//! 3. After a conflict, or where nobody knows what came of an item, the picture is not trusted any more.
+//! 3. After a conflict, or where nobody knows what came of an item, the projection is not trusted any more.
 
 use crate::reconcile::{Loop, Replies};
 use crate::requests::{Asked, Request};
 use midshift_core::fleet::projection::named;
 use midshift_core::fleet::{Plan, obeyed, put_right, refusals};
 use midshift_core::limits;
-use midshift_core::picture::{self, Outline};
+use midshift_core::projection::{self, Outline};
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Item, Key, Row, Seq, Table};
 use midshift_core::time::Now;
@@ -32,12 +32,12 @@ struct Sent {
 impl Sent {
     fn of(item: &Item) -> Self {
         let keys = item.rows.iter().map(|row| row.key.clone()).collect();
-        Self { kind: picture::kind_of(item), keys, obeys: obeyed(item), entries: picture::entries_of(item) }
+        Self { kind: projection::kind_of(item), keys, obeys: obeyed(item), entries: projection::entries_of(item) }
     }
 }
 
 impl Loop {
-    /// Commits the plan, and before it that this process still leads, if it is time to say so. An error: the picture can no longer be trusted.
+    /// Commits the plan, and before it that this process still leads, if it is time to say so. An error: the projection can no longer be trusted.
     pub(crate) async fn renew_and_commit(
         &mut self,
         renewal: Option<Item>,
@@ -131,7 +131,7 @@ impl Loop {
         put_right(&mut self.view, &keys, &rows)?;
         if keys.iter().any(|key| key.table == Table::FleetMark) {
             let consumed = self.view.marks.get("fleet").map_or(Seq(0), |mark| mark.row.seq);
-            // Their rows are in the picture already; only what they ask for is not done.
+            // Their rows are in the projection already; only what they ask for is not done.
             self.view.read_at = self.view.read_at.max(self.view.absorbed);
             self.seq = self.seq.min(consumed);
             self.behind = None;

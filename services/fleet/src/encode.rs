@@ -1,7 +1,7 @@
 //! Rows and explanations as their messages. Nothing is decided here.
 
 use midshift_core::fleet::explain::{RobotExplanation, TaskExplanation};
-use midshift_core::fleet::projection::View;
+use midshift_core::fleet::projection::FleetProjection;
 use midshift_core::fleet::rows::{
     Cordon, HoldToken, HolderState, Incident, Place, RobotControl, RobotCounter, RobotHolder,
 };
@@ -18,7 +18,7 @@ use midshift_proto::convert::{shown, timestamp};
 use midshift_proto::fleet::v1;
 
 /// What people and the breaker decided about a robot, and what it is taken by.
-pub fn control(view: &View, board: &Board, robot_id: &RobotId) -> v1::RobotControl {
+pub fn control(view: &FleetProjection, board: &Board, robot_id: &RobotId) -> v1::RobotControl {
     let rowed = view.control.get(robot_id.as_str());
     let row = rowed.map_or_else(|| RobotControl::new(robot_id.clone()), |c| c.row.clone());
     let holder = match view.authority.get(robot_id.as_str()).map(|a| &a.row.holder) {
@@ -68,7 +68,7 @@ fn cordon(cordon: Cordon) -> v1::Cordon {
 }
 
 /// The drain a robot is in, or the last that waits or was refused.
-fn drain(view: &View, robot_id: &RobotId) -> Option<v1::Drain> {
+fn drain(view: &FleetProjection, robot_id: &RobotId) -> Option<v1::Drain> {
     let drain = view.drain_of(robot_id).or_else(|| view.all_drains_of(robot_id).last())?;
     let within_ms = i64::try_from(drain.within_ms).unwrap_or(i64::MAX);
     Some(v1::Drain {
@@ -103,7 +103,7 @@ pub fn incident(row: &Incident, revision: Revision) -> v1::Incident {
 }
 
 /// A place with its holders and who waits for it.
-pub fn place(view: &View, row: &Place, revision: Revision) -> v1::Place {
+pub fn place(view: &FleetProjection, row: &Place, revision: Revision) -> v1::Place {
     let site = view.site.find_place(&row.place_id).map(|ix| view.site.place(ix));
     let kind = match site.map(|p| &p.kind) {
         Some(PlaceKind::Exclusive(_)) => v1::PlaceKind::Exclusive,
@@ -176,7 +176,7 @@ pub fn task_explanation(task_id: &TaskId, e: &TaskExplanation, now: Utc) -> v1::
 
 /// Why a robot has no work, or what it does.
 pub fn robot_explanation(
-    view: &View,
+    view: &FleetProjection,
     board: &Board,
     now: &Now,
     robot_id: &RobotId,

@@ -4,7 +4,7 @@ use crate::{FleetService, encode};
 use midshift_core::fleet::commands::Command;
 use midshift_core::fleet::objects::{sees_incident, sees_place, sees_robot, sees_task};
 use midshift_core::fleet::rows::Incident;
-use midshift_core::fleet::{explain, projection::View};
+use midshift_core::fleet::{explain, projection::FleetProjection};
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId};
 use midshift_core::limits;
@@ -183,7 +183,7 @@ impl FleetService {
         let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
         let by = by.clone();
-        self.look(move |view: &View, board, now| {
+        self.look(move |view: &FleetProjection, board, now| {
             let robots = view.sessions.values().map(|session| &session.row.robot_id);
             let robots = robots.filter(|robot_id| sees_robot(view, board, &by, robot_id));
             let (robots, next_page_token) = pages::page(robots.map(|id| (id.to_string(), id)), &r.page_token, size);
@@ -229,7 +229,7 @@ impl FleetService {
         bad.finish()?;
         let by = by.clone();
         let (places, next_page_token) = self
-            .look(move |view: &View, _, _| {
+            .look(move |view: &FleetProjection, _, _| {
                 let in_use = |p: &midshift_core::fleet::rows::Place| {
                     !p.holders.is_empty()
                         || p.quarantine.is_some()
@@ -286,7 +286,7 @@ impl FleetService {
         Ok(v1::ExplainTaskResponse { explanation: Some(explanation) })
     }
 
-    /// What the store says of a task that is not in the picture: it has ended, or was accepted a moment ago.
+    /// What the store says of a task that is not in the projection: it has ended, or was accepted a moment ago.
     async fn why_stored(&self, task_id: &TaskId, by: &Caller, now: Utc) -> Result<v1::TaskExplanation, Refusal> {
         let missing = || not_found(Code::TaskNotFound, task_id);
         let keys = [Table::TaskState, Table::TaskIntake].map(|table| Key::new(table, task_id.as_str()));
@@ -332,7 +332,7 @@ impl FleetService {
         bad.finish()?;
         let by = by.clone();
         let (incidents, next_page_token) = self
-            .look(move |view: &View, board, _| {
+            .look(move |view: &FleetProjection, board, _| {
                 let wanted = |i: &Incident| {
                     (r.include_closed || i.closed.is_none()) && (robot_id.is_none() || i.robot_id == robot_id)
                 };

@@ -17,7 +17,7 @@ pub use retention::prune;
 use midshift_core::Boxed;
 use midshift_core::fleet::Board;
 use midshift_core::fleet::commands::Command;
-use midshift_core::fleet::projection::View;
+use midshift_core::fleet::projection::FleetProjection;
 use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
@@ -77,13 +77,13 @@ impl FleetService {
             mpsc::error::TrySendError::Closed(_) => Refusal::new(Kind::Unavailable, Code::ShuttingDown),
         })
     }
-    /// Runs `look` on the picture and gives its answer.
+    /// Runs `look` on the projection and gives its answer.
     pub async fn look<T: Send + 'static>(
         &self,
-        look: impl FnOnce(&View, &Board, &Now) -> T + Send + 'static,
+        look: impl FnOnce(&FleetProjection, &Board, &Now) -> T + Send + 'static,
     ) -> Result<T, Refusal> {
         let (reply, answer) = oneshot::channel();
-        let look = move |view: &View, board: &Board, now: &Now| drop(reply.send(look(view, board, now)));
+        let look = move |view: &FleetProjection, board: &Board, now: &Now| drop(reply.send(look(view, board, now)));
         self.send(Request::Look(Box::new(look))).await?;
         answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::ShuttingDown))
     }

@@ -1,19 +1,19 @@
-//! The loop: take what is new, decide, commit (`commit`), publish. A conflict means that somebody else decided too: the picture is built again.
+//! The loop: take what is new, decide, commit (`commit`), publish. A conflict means that somebody else decided too: the projection is built again.
 //! Each turn is a slice of some milliseconds; between two, people are answered. A turn takes a few requests *and* a sweep that is due: neither
 //! keeps the other waiting.
-//! Of several processes on one store one leads and does all that; the others keep their picture by rows alone (`standby`).
+//! Of several processes on one store one leads and does all that; the others keep their projection by rows alone (`standby`).
 //!
 //! Invariant: the view has absorbed the feed up to a head of it before anything is planned on it, never a part of a commit; only a process that leads plans, and one that could not
 //! say so for a while reads the rows again before it does.
 
 use crate::requests::{Asked, Look, MapOutdated, Parts, Request};
-use midshift_core::fleet::projection::{self, View};
+use midshift_core::fleet::projection::{self, FleetProjection};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, explain, found, maps, objects};
 use midshift_core::identity::Actor;
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::once;
-use midshift_core::picture;
+use midshift_core::projection::entries_of;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Key, Log, Seq, Table};
 use midshift_core::time::Now;
@@ -35,7 +35,7 @@ const TIMER_GRAIN: Duration = Duration::from_millis(1);
 
 pub(crate) struct Loop {
     pub(crate) parts: Parts,
-    pub(crate) view: View,
+    pub(crate) view: FleetProjection,
     pub(crate) seq: Seq,
     pub(crate) board: Board,
     dirty: Dirty<Live>,
@@ -80,7 +80,7 @@ pub async fn run(
     let mut wake = parts.store.wake();
     let started = parts.clock.now();
     let dirty = parts.board.watch();
-    let view = View::new(parts.site.clone(), started, started);
+    let view = FleetProjection::new(parts.site.clone(), started, started);
     // A store of one process is its process' alone; and a simulation's, whose runs must be the same again.
     let me = match parts.store.is_shared() {
         true => format!("{:032x}", rand::random::<u128>()),
@@ -194,7 +194,8 @@ impl Loop {
     fn begin_to_lead(&mut self) {
         self.started = self.parts.clock.now();
         let router = self.view.router.clone();
-        self.view = View { router, ..View::new(self.parts.site.clone(), self.started, self.started) };
+        self.view =
+            FleetProjection { router, ..FleetProjection::new(self.parts.site.clone(), self.started, self.started) };
         metrics::gauge!("midshift_fleet_leads").set(1);
         metrics::counter!("midshift_fleet_takeovers_total").increment(1);
         tracing::info!("this process leads fleet");
@@ -209,7 +210,7 @@ impl Loop {
         leads_no_more();
     }
 
-    /// Builds the picture from nothing and takes what was not consumed yet. A process that leads makes sure that it may plan on its map.
+    /// Builds the projection from nothing and takes what was not consumed yet. A process that leads makes sure that it may plan on its map.
     pub(crate) async fn rebuild(&mut self) -> Result<(), Error> {
         self.take_part().await?;
         self.own.clear();
@@ -219,7 +220,7 @@ impl Loop {
         let snapshot = lead::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
         let now = self.parts.clock.now();
         let served = self.view.serving(&now);
-        let mut next = View::new(self.parts.site.clone(), self.started, now);
+        let mut next = FleetProjection::new(self.parts.site.clone(), self.started, now);
         next.bugs = self.parts.bugs;
         next.carry_over(&mut self.view);
         self.view = next;
@@ -243,7 +244,7 @@ impl Loop {
         }
         let mut plan = Plan::default();
         found(&mut self.view, self.parts.clock.now(), &self.parts.site_text, &self.parts.map, &mut plan);
-        let entries: Vec<u64> = plan.items.iter().map(picture::entries_of).collect();
+        let entries: Vec<u64> = plan.items.iter().map(entries_of).collect();
         for (result, entries) in self.parts.store.commit(plan.items).await.into_iter().zip(entries) {
             let applied = result.map_err(|error| Error::Unavailable(std::sync::Arc::new(error)))?;
             self.own.wrote(applied.seq.0, entries);
@@ -251,7 +252,7 @@ impl Loop {
         Ok(())
     }
 
-    /// One turn. An error: the picture can no longer be trusted.
+    /// One turn. An error: the projection can no longer be trusted.
     async fn turn(&mut self, pace: Pace, requests: Vec<Request>) -> Result<(), ()> {
         let again = std::mem::take(&mut self.again);
         let requests = again.into_iter().chain(requests).collect();
@@ -309,7 +310,7 @@ impl Loop {
         self.ask(used_ids(&requests)).await.map_err(unread)?;
         let renewal = match self.seat.stance(now.link) {
             Stance::StepDown => {
-                // What was planned a moment ago is dropped, and with it the picture that holds it.
+                // What was planned a moment ago is dropped, and with it the projection that holds it.
                 self.rebuild().await.map_err(|error| tracing::warn!(%error, "fleet cannot read the store"))?;
                 return self.assist(requests).await;
             }
@@ -369,7 +370,7 @@ impl Loop {
         self.share = share.clamp(limits::DECISIONS_PER_STAGE_MIN, limits::DECISIONS_PER_STAGE);
     }
 
-    /// Answers as many questions as a turn has time for from the picture, which holds only what is committed at this moment. What it finds of
+    /// Answers as many questions as a turn has time for from the projection, which holds only what is committed at this moment. What it finds of
     /// robots on the way serves all of them.
     pub(crate) fn answer(&mut self, now: Now) {
         self.view.screened.take();
@@ -405,7 +406,7 @@ impl Loop {
         Ok(())
     }
 
-    /// Reads by id what the picture wants to know of what is over, and these rows too.
+    /// Reads by id what the projection wants to know of what is over, and these rows too.
     pub(crate) async fn ask(&mut self, mut keys: Vec<Key>) -> Result<(), Error> {
         keys.extend(self.view.wanted());
         if keys.is_empty() {
@@ -478,7 +479,7 @@ fn used_ids(requests: &[Request]) -> Vec<Key> {
 }
 
 /// Counts and waiting reasons as metrics; nothing of it goes through the store.
-fn publish(plan: &Plan, view: &View, pace: Pace) {
+fn publish(plan: &Plan, view: &FleetProjection, pace: Pace) {
     let report = &plan.report;
     metrics::counter!("midshift_fleet_offers_total").increment(report.offers);
     metrics::counter!("midshift_fleet_errands_total").increment(report.errands);

@@ -3,7 +3,7 @@
 use midshift_core::fleet::Board;
 use midshift_core::fleet::commands::Command;
 use midshift_core::fleet::maps::MapChange;
-use midshift_core::fleet::projection::View;
+use midshift_core::fleet::projection::FleetProjection;
 use midshift_core::identity::Caller;
 use midshift_core::reason::{Reason, Refusal};
 use midshift_core::rows::Revision;
@@ -50,8 +50,8 @@ impl fmt::Display for MapOutdated {
 
 impl std::error::Error for MapOutdated {}
 
-/// A question about the picture as it is now.
-pub(crate) type Look = Box<dyn FnOnce(&View, &Board, &Now) + Send>;
+/// A question about the projection as it is now.
+pub(crate) type Look = Box<dyn FnOnce(&FleetProjection, &Board, &Now) + Send>;
 
 /// Something a person asks of the reconciler.
 pub(crate) enum Request {

@@ -1,6 +1,6 @@
-//! A process that does not lead: it keeps its picture by rows alone, answers from it, and carries out what people ask.
+//! A process that does not lead: it keeps its projection by rows alone, answers from it, and carries out what people ask.
 //!
-//! Invariant: it decides nothing but commands. Each is decided on the picture, committed on the condition that nothing of it has changed,
+//! Invariant: it decides nothing but commands. Each is decided on the projection, committed on the condition that nothing of it has changed,
 //! and decided anew if something has; the process that leads obeys what is written.
 
 use crate::reconcile::Loop;
@@ -10,7 +10,7 @@ use midshift_core::fleet::{LOGS, Tx, follow_rows, objects, reread};
 use midshift_core::identity::Actor;
 use midshift_core::limits;
 use midshift_core::once;
-use midshift_core::picture;
+use midshift_core::projection;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Entry, Item, Key, Table};
 use midshift_store::{CommitError, Error, follow};
@@ -40,7 +40,7 @@ impl Loop {
         Ok(seen?)
     }
 
-    /// Answers, and carries out what people ask. An error: the picture can no longer be trusted.
+    /// Answers, and carries out what people ask. An error: the projection can no longer be trusted.
     pub(crate) async fn assist(&mut self, requests: Vec<Request>) -> Result<(), ()> {
         let mut trusted = Ok(());
         for request in requests {
@@ -65,7 +65,7 @@ impl Loop {
         Ok(())
     }
 
-    /// The answer to whoever asked. An error: what came of it may not be in the picture.
+    /// The answer to whoever asked. An error: what came of it may not be in the projection.
     async fn carry_out(&mut self, asked: &Asked) -> Result<Result<(), Refusal>, Error> {
         let used: Vec<Key> = asked.request_id.iter().map(|id| Key::new(Table::CommandKey, id)).collect();
         for _ in 0..limits::COMMAND_TRIES {
@@ -79,7 +79,7 @@ impl Loop {
                     return Ok(Err(refusal));
                 }
             };
-            let keys = picture::touched(std::slice::from_ref(&item));
+            let keys = projection::touched(std::slice::from_ref(&item));
             match self.parts.store.commit(vec![item]).await.pop() {
                 Some(Ok(_)) => return Ok(Ok(())),
                 Some(Err(CommitError::Conflict { .. })) => {

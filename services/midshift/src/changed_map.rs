@@ -5,7 +5,7 @@
 use anyhow::Context;
 use midshift_cli::site_file::Loaded;
 use midshift_core::fleet::maps::{MapChange, in_the_way};
-use midshift_core::fleet::projection::{View, alive, named};
+use midshift_core::fleet::projection::{FleetProjection, alive, named};
 use midshift_core::fleet::rows::SiteRow;
 use midshift_core::site::{Site, read_stored};
 use midshift_core::time::Now;
@@ -21,7 +21,7 @@ pub async fn choose(
 ) -> anyhow::Result<(Loaded, MapChange)> {
     let Some((row, stored)) = other_stored(store, &loaded).await? else { return Ok((loaded, MapChange::Taken)) };
     let snapshot = store.read(&alive(), named).await.context("reading what is in the way of the changed map")?;
-    let mut view = View::new(stored.clone(), now, now);
+    let mut view = FleetProjection::new(stored.clone(), now, now);
     view.load(&snapshot.rows, snapshot.seq).context("reading what is in the way of the changed map")?;
     let obstacles = in_the_way(&view, &stored, &loaded.site);
     let (version, count) = (loaded.site.map_version().to_owned(), obstacles.len());

@@ -9,7 +9,7 @@ use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_edge::tls::{Clients, server_config};
-use midshift_edge::{Anybody, Config, Denials, Edge, Known, Listen, Listener, Rate, connections_max};
+use midshift_edge::{Anybody, Config, Denials, Edge, Listen, Listener, Rate, SitePrincipals, connections_max};
 use rustls::ServerConfig;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
@@ -129,7 +129,7 @@ async fn serve_all(
         return Ok(());
     };
     let Login { site_id, clock, mut directory, mut proof, denials } = login;
-    let known = Arc::new(Known::new(site_id, clock.clone()));
+    let known = Arc::new(SitePrincipals::new(site_id, clock.clone()));
     known.publish((**directory.borrow_and_update()).clone());
     let tls = watch::Sender::new(tls(&proof.borrow_and_update().clone(), &clock)?);
     let edge = Edge::new(config, known.clone(), services).with_tls(tls.subscribe()).with_denials(denials);

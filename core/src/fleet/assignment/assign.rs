@@ -8,7 +8,7 @@ use super::filters;
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::{RobotControl, TimerKind};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::transitions::{News, arm, happen};
 use crate::fleet::tasks::{attempts, errand_reports};
 use crate::fleet::traffic::anchor::anchor;
@@ -24,7 +24,13 @@ use std::collections::BTreeSet;
 ///
 /// A walk offers every ready task to the robots that are idle when it begins. Robots that found nothing walk again once they are heard;
 /// until then they are offered only tasks that are new.
-pub fn plan(view: &mut View, board: &Board, now: Now, heard: &BTreeSet<RobotId>, plan: &mut Plan) -> Vec<Candidate> {
+pub fn plan(
+    view: &mut FleetProjection,
+    board: &Board,
+    now: Now,
+    heard: &BTreeSet<RobotId>,
+    plan: &mut Plan,
+) -> Vec<Candidate> {
     let wanted = !view.queue.is_empty();
     let mut idle =
         Pool::of(view, board, |r| (wanted || heard.contains(r)) && filters::robot(view, board, r, &now).is_ok());

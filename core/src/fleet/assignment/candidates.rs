@@ -6,7 +6,7 @@
 use super::filters;
 use crate::fleet::decision::slice::Slice;
 use crate::fleet::projection::liveness::Board;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::traffic::routing;
 use crate::ids::RobotId;
 use crate::site::WaypointIx;
@@ -33,7 +33,7 @@ pub struct Pool {
 
 impl Pool {
     /// Robots of the board for which `can` holds.
-    pub fn of(view: &View, board: &Board, can: impl Fn(&RobotId) -> bool) -> Self {
+    pub fn of(view: &FleetProjection, board: &Board, can: impl Fn(&RobotId) -> bool) -> Self {
         let known = board.iter().filter(|(id, _)| can(id));
         let all: Vec<_> = known
             .filter_map(|(id, live)| {
@@ -65,7 +65,7 @@ impl Pool {
     /// far, id. Each robot that the filters look at is a look of the slice.
     pub fn take(
         &mut self,
-        view: &View,
+        view: &FleetProjection,
         board: &Board,
         task: &TaskState,
         intake: &TaskIntake,
@@ -110,7 +110,7 @@ impl Pool {
 }
 
 /// First goal of what is left of the task.
-fn first_goal(view: &View, task: &TaskState, intake: &TaskIntake) -> Option<WaypointIx> {
+fn first_goal(view: &FleetProjection, task: &TaskState, intake: &TaskIntake) -> Option<WaypointIx> {
     let from = crate::work::from_step(&intake.spec.steps, task.next_step);
     intake.spec.next_goal(from as usize).and_then(|g| view.site.find(g))
 }

@@ -6,7 +6,7 @@ use super::candidates::Candidate;
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::{RobotControl, TimerKind};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::attempts;
 use crate::fleet::tasks::transitions::arm;
 use crate::fleet::traffic::anchor::anchor;
@@ -20,7 +20,7 @@ use crate::work::Session;
 use std::collections::BTreeMap;
 
 /// Sends robots that are still idle to charge or park.
-pub fn plan(view: &mut View, board: &Board, now: Now, idle: Vec<Candidate>, plan: &mut Plan) {
+pub fn plan(view: &mut FleetProjection, board: &Board, now: Now, idle: Vec<Candidate>, plan: &mut Plan) {
     let waiting = !view.queue.is_empty();
     let mut coming = Coming::of(view);
     for Candidate { robot_id, at: here, .. } in idle {
@@ -47,7 +47,7 @@ pub fn plan(view: &mut View, board: &Board, now: Now, idle: Vec<Candidate>, plan
 struct Coming(BTreeMap<WaypointId, usize>);
 
 impl Coming {
-    fn of(view: &View) -> Self {
+    fn of(view: &FleetProjection) -> Self {
         let mut coming = Self(BTreeMap::new());
         for a in view.attempts.values().map(|a| &a.row).filter(|a| !a.phase.is_terminal()) {
             if let Some(goal) = &a.goal {
@@ -56,7 +56,7 @@ impl Coming {
         }
         coming
     }
-    fn add(&mut self, view: &View, robot_id: &RobotId, goal: &WaypointId) {
+    fn add(&mut self, view: &FleetProjection, robot_id: &RobotId, goal: &WaypointId) {
         let place = view.places.get(goal.as_str()).map(|p| &p.row);
         if place.is_none_or(|p| p.holder(robot_id).is_none()) {
             *self.0.entry(goal.clone()).or_default() += 1;
@@ -65,7 +65,7 @@ impl Coming {
 }
 
 fn wish(
-    view: &View,
+    view: &FleetProjection,
     coming: &Coming,
     robot_id: &RobotId,
     here: WaypointIx,
@@ -90,12 +90,12 @@ fn wish(
 }
 
 /// Where a robot that stands at `here` would park; none if it parks already or everything is taken.
-pub(in crate::fleet) fn park_for(view: &View, robot_id: &RobotId, here: WaypointIx) -> Option<WaypointIx> {
+pub(in crate::fleet) fn park_for(view: &FleetProjection, robot_id: &RobotId, here: WaypointIx) -> Option<WaypointIx> {
     let parks = view.site.waypoint(here).kind == Kind::Park || !view.site.collisions_modelled();
     if parks { None } else { park_goal(view, &Coming::of(view), robot_id, here) }
 }
 
-fn park_goal(view: &View, coming: &Coming, robot_id: &RobotId, here: WaypointIx) -> Option<WaypointIx> {
+fn park_goal(view: &FleetProjection, coming: &Coming, robot_id: &RobotId, here: WaypointIx) -> Option<WaypointIx> {
     let free = |goals: &mut dyn Iterator<Item = WaypointIx>| free(view, coming, robot_id, here, goals);
     let goal = match free(&mut view.site.parks()) {
         None if view.site.waypoint(here).kind == Kind::Hold => None,
@@ -107,7 +107,7 @@ fn park_goal(view: &View, coming: &Coming, robot_id: &RobotId, here: WaypointIx)
 
 /// The nearest of `goals` with room that no other errand is on its way to.
 fn free(
-    view: &View,
+    view: &FleetProjection,
     coming: &Coming,
     robot_id: &RobotId,
     here: WaypointIx,

@@ -7,7 +7,7 @@ use crate::fleet::facts::{answers, disbelief, maps, repair};
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::queue::Wait;
 use crate::fleet::projection::rows::RobotHolder;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::eligibility::{another_could, decided_by_people, fits, reported};
 use crate::fleet::tasks::{claims, load, plausible};
 use crate::fleet::traffic::{engaged_stops, routing};
@@ -24,7 +24,7 @@ use crate::work::{Live, StepKind};
 pub const RESERVE_PERMILLE: u64 = 100;
 
 /// Whether the robot can be given any work at all now.
-pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Result<(), Reason> {
+pub fn robot(view: &FleetProjection, board: &Board, robot_id: &RobotId, now: &Now) -> Result<(), Reason> {
     let Some(session) = view.sessions.get(robot_id.as_str()).map(|s| &s.row) else {
         return Err(Code::RobotOffline.into());
     };
@@ -70,7 +70,7 @@ pub fn robot(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> Resul
 
 /// Whether this robot, apart from being busy, may be given this task.
 pub fn pair(
-    view: &View,
+    view: &FleetProjection,
     board: &Board,
     robot_id: &RobotId,
     task: &TaskState,
@@ -110,7 +110,7 @@ pub fn pair(
 
 /// Keeps a task for a while from a robot that failed it, as long as another could do it.
 fn prefer_others(
-    view: &View,
+    view: &FleetProjection,
     robot_id: &RobotId,
     task: &TaskState,
     intake: &TaskIntake,
@@ -128,7 +128,7 @@ fn prefer_others(
 }
 
 /// A robot that refused this task is asked again only once it has said something newer.
-fn just_refused(view: &View, live: &Live, task: &TaskState) -> Result<(), Reason> {
+fn just_refused(view: &FleetProjection, live: &Live, task: &TaskState) -> Result<(), Reason> {
     let last = task.attempt_id().and_then(|id| view.attempt(&id)).filter(|a| a.robot_id == live.robot_id);
     match last {
         Some(a)
@@ -144,7 +144,7 @@ fn just_refused(view: &View, live: &Live, task: &TaskState) -> Result<(), Reason
 
 /// Where the robot stands, and the goals that are left.
 fn journey(
-    view: &View,
+    view: &FleetProjection,
     live: &Live,
     task: &TaskState,
     intake: &TaskIntake,
@@ -156,7 +156,7 @@ fn journey(
 }
 
 /// No closed place may bar the way to a goal, nor be one.
-fn place(view: &View, here: WaypointIx, goals: &[WaypointIx]) -> Result<(), Reason> {
+fn place(view: &FleetProjection, here: WaypointIx, goals: &[WaypointIx]) -> Result<(), Reason> {
     let closed = routing::closed(view);
     if closed.is_empty() {
         return Ok(());
@@ -173,7 +173,13 @@ fn place(view: &View, here: WaypointIx, goals: &[WaypointIx]) -> Result<(), Reas
 
 /// The charge must last for all steps and the way from the last goal to the nearest charger, with its reserve; no goal may be one from which
 /// no charger can be reached. A site without chargers has no way home.
-fn energy(view: &View, live: &Live, here: WaypointIx, last: WaypointIx, mut trip: Trip) -> Result<(), Reason> {
+fn energy(
+    view: &FleetProjection,
+    live: &Live,
+    here: WaypointIx,
+    last: WaypointIx,
+    mut trip: Trip,
+) -> Result<(), Reason> {
     if view.site.chargers().next().is_none() {
         return Ok(());
     }
@@ -192,7 +198,13 @@ fn energy(view: &View, live: &Live, here: WaypointIx, last: WaypointIx, mut trip
 }
 
 /// Whether the task may be offered now, whatever the robots.
-pub fn task(view: &View, board: &Board, task: &TaskState, intake: &TaskIntake, now: &Now) -> Result<(), Reason> {
+pub fn task(
+    view: &FleetProjection,
+    board: &Board,
+    task: &TaskState,
+    intake: &TaskIntake,
+    now: &Now,
+) -> Result<(), Reason> {
     match task.phase {
         Phase::Queued => {}
         Phase::RetryWait => return Err(Code::WaitingForRetry.into()),
@@ -209,7 +221,7 @@ pub fn task(view: &View, board: &Board, task: &TaskState, intake: &TaskIntake, n
 }
 
 /// An idle-looking errand that may be broken off for a task: parking, or charging above the area's threshold.
-pub fn recallable(view: &View, board: &Board, robot_id: &RobotId) -> bool {
+pub fn recallable(view: &FleetProjection, board: &Board, robot_id: &RobotId) -> bool {
     let Some(id) = view.held_by(robot_id) else { return false };
     let Some(a) = view.attempt(id) else { return false };
     let Subject::Errand { .. } = id.subject else { return false };

@@ -6,7 +6,7 @@ use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Plan;
 use crate::fleet::projection::index::advance;
 use crate::fleet::projection::queue::{TASKS_PER_TURN, Wait};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::transitions::{News, happen};
 use crate::fleet::tasks::{eligibility, timers};
 use crate::ids::TaskId;
@@ -16,7 +16,7 @@ use crate::task::Event;
 use crate::time::{Now, Utc};
 
 /// Brings the queue up to now: notes since when a task is ready, arms what counts from then, and gives to a person what can never be ready.
-pub(in crate::fleet) fn settle(view: &mut View, now: Now, plan: &mut Plan) {
+pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     advance(view, now.utc);
     for task_id in view.queue.failed.iter().take(TASKS_PER_TURN).cloned().collect::<Vec<_>>() {
         let why = view.queue.waiting.get(&task_id).and_then(|w| w.wait.reason());
@@ -44,14 +44,14 @@ pub(in crate::fleet) fn settle(view: &mut View, now: Now, plan: &mut Plan) {
 }
 
 /// Gives a waiting task to a person.
-fn ask_person(view: &mut View, now: Now, task_id: &TaskId, why: Option<&Reason>, plan: &mut Plan) {
+fn ask_person(view: &mut FleetProjection, now: Now, task_id: &TaskId, why: Option<&Reason>, plan: &mut Plan) {
     plan.decide(view, now, "fleet", |tx| {
         happen(tx, task_id, News::of(Event::ScheduleToStart, why));
     });
 }
 
 /// A task that is ready for long and that no known robot could ever do goes to a person.
-fn check_robots(view: &mut View, now: Now, plan: &mut Plan) {
+fn check_robots(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     while let Some(task_id) = view.queue.unchecked.first().filter(|_| !plan.is_cut()).cloned() {
         view.queue.unchecked.remove(&task_id);
         let Some((task, intake)) = view.task(&task_id).zip(view.intake(&task_id)) else { continue };
@@ -62,7 +62,7 @@ fn check_robots(view: &mut View, now: Now, plan: &mut Plan) {
 }
 
 /// One incident of the site tells of a backlog. It closes by itself, and opens again after a pause.
-pub(in crate::fleet) fn tell_backlog(view: &mut View, now: Now, plan: &mut Plan) {
+pub(in crate::fleet) fn tell_backlog(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     let id = format!("{}:{}", Code::TaskBacklog, view.site.site_id());
     let known = view.incidents.get(&id).map(|incident| &incident.row);
     let old = view.queue.oldest().filter(|(since, _)| now.ms_since(*since) > limits::BACKLOG_AGE.as_ms());

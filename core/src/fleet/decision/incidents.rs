@@ -4,7 +4,7 @@
 
 use super::plan::{Plan, Tx};
 use crate::fleet::projection::rows::{Closed, Incident};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{PlaceId, RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -110,7 +110,7 @@ pub fn close(tx: &mut Tx, incident_id: &str, reason: &str, actor: &str) {
 }
 
 /// Tells people of every decision, and of every row of a newer version, that was put aside since.
-pub fn open_put_aside(view: &mut View, now: Now, plan: &mut Plan) {
+pub fn open_put_aside(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     let untold: Vec<_> = view.refused.take_untold().into_iter().chain(view.unknown_rows.take_untold()).collect();
     for (reason, robot_id) in untold {
         plan.decide(view, now, "fleet", |tx| open_once(tx, reason, robot_id.as_ref()));

@@ -6,13 +6,13 @@ use super::refusals;
 use super::report::Report;
 use super::slice::Slice;
 use crate::fleet::projection::rows::FleetMark;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::identity::Actor;
 use crate::rows::{Item, Seq};
 use crate::time::Now;
 
 /// A decision of fleet under way.
-pub type Tx<'a> = crate::picture::Tx<'a, View>;
+pub type Tx<'a> = crate::projection::Tx<'a, FleetProjection>;
 
 /// Items to commit, in order, and the report.
 #[derive(Debug, Default)]
@@ -33,7 +33,7 @@ impl Plan {
     /// Makes one decision; nothing is added if it changed nothing. False: it was given up, since the store would never take it.
     pub fn decide(
         &mut self,
-        view: &mut View,
+        view: &mut FleetProjection,
         now: Now,
         actor: impl Into<Actor>,
         decision: impl FnOnce(&mut Tx),

@@ -4,27 +4,27 @@
 //! places it is about get no work and no grant. It is tried again when one of its rows changes, when its robot opens a session, or when a
 //! person closes its incident. Invariant: what is aside never reaches the store, and a person is told of it once.
 
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::RobotId;
-use crate::picture::Outline;
+use crate::projection::Outline;
 use crate::rows::{Key, Table};
 use std::collections::BTreeSet;
 
 /// Notes that the store refused a decision for good, or would; the second time puts it aside.
-pub fn note_refusal(view: &mut View, outline: Outline) {
+pub fn note_refusal(view: &mut FleetProjection, outline: Outline) {
     let robots = robots_of(view, &outline);
     view.refused.note(outline, robots);
 }
 
 /// The store refused a decision for good: it is noted, and what it was about is looked at again.
-pub fn undone(view: &mut View, outline: Outline) {
+pub fn undone(view: &mut FleetProjection, outline: Outline) {
     let robots = robots_of(view, &outline);
     view.refused.look_again(robots);
     note_refusal(view, outline);
 }
 
 /// Looks again at robots of decisions that were undone, or are not aside any more.
-pub(in crate::fleet) fn try_again(view: &mut View) {
+pub(in crate::fleet) fn try_again(view: &mut FleetProjection) {
     let robots = view.refused.take_again();
     view.compared.retain(|robot_id, _| !robots.contains(robot_id));
     view.dirty.extend(robots.iter().cloned());
@@ -32,7 +32,7 @@ pub(in crate::fleet) fn try_again(view: &mut View) {
 }
 
 /// Robots that rows are about.
-fn robots_of(view: &View, outline: &Outline) -> BTreeSet<RobotId> {
+fn robots_of(view: &FleetProjection, outline: &Outline) -> BTreeSet<RobotId> {
     let robot = |key: &Key| match key.table {
         Table::RobotAuthority | Table::RobotControl | Table::DesiredWork | Table::DesiredPolicy => {
             RobotId::parse(&key.id).ok()
@@ -56,8 +56,8 @@ mod tests {
     use crate::time::Now;
     use std::sync::Arc;
 
-    fn view() -> View {
-        View::new(Arc::new(text::parse(CORRIDOR).expect("reads")), Now::default(), Now::default())
+    fn view() -> FleetProjection {
+        FleetProjection::new(Arc::new(text::parse(CORRIDOR).expect("reads")), Now::default(), Now::default())
     }
 
     fn robot() -> RobotId {
@@ -74,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn a_decision_that_no_store_takes_leaves_the_picture_as_it_was_and_is_put_aside_at_the_second_time() {
+    fn a_decision_that_no_store_takes_leaves_the_projection_as_it_was_and_is_put_aside_at_the_second_time() {
         let (mut view, now, mut plan) = (view(), Now::default(), Plan::default());
         assert!(!plan.decide(&mut view, now, "tests", too_much));
         assert!(view.holds.is_empty() && view.authority.is_empty() && plan.items.is_empty());

@@ -5,7 +5,7 @@ use crate::fleet::assignment::filters;
 use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::facts::misreads;
 use crate::fleet::projection::liveness::Board;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::load;
 use crate::fleet::traffic::{closures, routing};
 use crate::ids::{RobotId, TaskId};
@@ -43,7 +43,7 @@ pub struct TaskExplanation {
 }
 
 /// Explains one task; none if it is not known or has ended.
-pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<TaskExplanation> {
+pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) -> Option<TaskExplanation> {
     if let Some(reason) = view.unknown_rows.of_task(task_id) {
         return Some(unknown(reason.clone()));
     }
@@ -96,7 +96,7 @@ pub fn task(view: &View, board: &Board, now: &Now, task_id: &TaskId) -> Option<T
 }
 
 /// Why each robot with a session gets no work, looked at once for all explanations of a turn.
-fn screened<'v>(view: &'v View, board: &Board, now: &Now) -> &'v BTreeMap<RobotId, Option<Reason>> {
+fn screened<'v>(view: &'v FleetProjection, board: &Board, now: &Now) -> &'v BTreeMap<RobotId, Option<Reason>> {
     let against = |robot_id: &RobotId| filters::robot(view, board, robot_id, now).err();
     let robots = || view.sessions.values().map(|session| session.row.robot_id.clone());
     view.screened.get_or_init(|| robots().map(|robot_id| (robot_id.clone(), against(&robot_id))).collect())
@@ -107,7 +107,7 @@ pub fn per_turn(robots: usize) -> usize {
     (limits::ROBOTS_ASKED_PER_TURN / robots.max(1)).max(1)
 }
 
-/// A task that is not in the picture: how it ended, or that the planner has not read it yet.
+/// A task that is not in the projection: how it ended, or that the planner has not read it yet.
 pub fn stored(task: &TaskState) -> TaskExplanation {
     let unread = || Reason::from(Code::WaitingInQueue).with(WAITS_FOR, "the planner: it has not read the task yet");
     let verdict = Some(if task.phase.is_terminal() { standing::ended(task) } else { unread() });
@@ -133,7 +133,7 @@ fn absent(robot_id: &RobotId) -> String {
 }
 
 /// Why a ready task waits, since when, and what waiting has brought it.
-fn waits_for_turn(view: &View, task_id: &TaskId, now: &Now, code: Code) -> Reason {
+fn waits_for_turn(view: &FleetProjection, task_id: &TaskId, now: &Now, code: Code) -> Reason {
     let Some(rank) = view.queue.rank(task_id) else { return code.into() };
     let (class, minutes) = (rank.class.as_str(), now.utc.ms_since(rank.since) / 60_000);
     if !rank.promoted {
@@ -164,7 +164,7 @@ pub struct RobotExplanation {
 }
 
 /// Explains one robot; none if it never connected, nor was refused.
-pub fn robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Option<RobotExplanation> {
+pub fn robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotId) -> Option<RobotExplanation> {
     let refused = misreads::unheard(view, board, now, robot_id);
     if !view.unknown_rows.names(robot_id) && refused.is_none() {
         view.sessions.get(robot_id.as_str())?;
@@ -206,7 +206,7 @@ fn barring(why: Option<&Reason>) -> Option<&Reason> {
 
 /// The robot carries what is of no task that waits for it, its own item of one that waits for a person or for its next try, or what a person has
 /// put back.
-fn carries(view: &View, board: &Board, robot_id: &RobotId) -> Option<Reason> {
+fn carries(view: &FleetProjection, board: &Board, robot_id: &RobotId) -> Option<Reason> {
     let load = load::carried(view, board.get(robot_id)?)?;
     let task = load.task_id.as_ref().and_then(|id| view.task(id));
     let is_its_own = |task: &TaskState| {

@@ -9,7 +9,7 @@
 use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Plan;
 use crate::fleet::projection::liveness::{self, Board};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::eligibility;
 use crate::ids::RobotId;
 use crate::limits;
@@ -33,19 +33,19 @@ fn list_own_reasons(report: &ReportedState) -> Vec<Reason> {
 }
 
 /// The breaker of a robot, if it is open.
-fn breaker(view: &View, robot_id: &RobotId) -> Option<Reason> {
+fn breaker(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> {
     let control = view.control.get(robot_id.as_str()).map(|c| &c.row).filter(|c| c.breaker.is_some())?;
     Some(Reason::from(Code::RobotBreakerOpened).with("failures", control.failures.len()))
 }
 
 /// How long something lasts before people are told of it, where the robot is.
-fn patience(view: &View, live: Option<&Live>) -> LinkDuration {
+fn patience(view: &FleetProjection, live: Option<&Live>) -> LinkDuration {
     let area = live.and_then(|live| live.area(&view.site));
     area.map_or(limits::LASTS_BEFORE_INCIDENT, |area| LinkDuration(view.policy(area).incident_after_ms))
 }
 
 /// Opens what has lasted long enough, and closes what is over.
-pub(in crate::fleet) fn tell_lasting(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
+pub(in crate::fleet) fn tell_lasting(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan) {
     let mut before = std::mem::take(&mut view.lasting);
     let open: BTreeSet<(RobotId, Code)> = view
         .incidents

@@ -12,7 +12,7 @@ use crate::fleet::facts::stops::Hold;
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::queue::Wait;
 use crate::fleet::projection::rows::{Place, RobotHolder};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::{claims, eligibility, plausible};
 use crate::fleet::traffic::{closures, engaged_stops, places, starts};
 use crate::ids::{PlaceId, RobotId};
@@ -32,7 +32,13 @@ pub fn is_told(reason: &Reason) -> bool {
 }
 
 /// Why a task that has not ended is where it is. None: nothing is in its way but the choice of a robot, or nobody can say.
-pub fn of_task(view: &View, board: &Board, now: &Now, task: &TaskState, intake: &TaskIntake) -> Option<Reason> {
+pub fn of_task(
+    view: &FleetProjection,
+    board: &Board,
+    now: &Now,
+    task: &TaskState,
+    intake: &TaskIntake,
+) -> Option<Reason> {
     match task.phase {
         Phase::Queued => queued(view, board, now, task, intake),
         Phase::RetryWait => {
@@ -58,7 +64,7 @@ pub fn of_task(view: &View, board: &Board, now: &Now, task: &TaskState, intake: 
     }
 }
 
-fn queued(view: &View, board: &Board, now: &Now, task: &TaskState, intake: &TaskIntake) -> Option<Reason> {
+fn queued(view: &FleetProjection, board: &Board, now: &Now, task: &TaskState, intake: &TaskIntake) -> Option<Reason> {
     let why = filters::task(view, board, task, intake, now).err()?;
     let what = match Wait::of(task, intake, &view.ended, now.utc) {
         Wait::Time(at) => at.rfc3339(),
@@ -85,7 +91,7 @@ pub fn ended(task: &TaskState) -> Reason {
 }
 
 /// What a robot does with an attempt, or what both wait for. None: nobody can say.
-pub fn of_attempt(view: &View, board: &Board, now: &Now, a: &Attempt) -> Option<Reason> {
+pub fn of_attempt(view: &FleetProjection, board: &Board, now: &Now, a: &Attempt) -> Option<Reason> {
     let robot_id = &a.robot_id;
     if view.held_by(robot_id) != Some(&a.attempt) {
         return None;
@@ -117,14 +123,14 @@ pub fn of_attempt(view: &View, board: &Board, now: &Now, a: &Attempt) -> Option<
 }
 
 /// Why the record has let an attempt go that its robot may still have.
-fn explain_let_go(view: &View, a: &Attempt) -> Reason {
+fn explain_let_go(view: &FleetProjection, a: &Attempt) -> Reason {
     let task = a.attempt.subject.task_id().and_then(|id| view.task(id));
     let newest = task.filter(|task| task.attempt_id().as_ref() == Some(&a.attempt));
     newest.and_then(|task| task.reason.clone()).unwrap_or_else(|| Code::Forced.into())
 }
 
 /// The robot works on this step of the attempt.
-fn works(view: &View, now: &Now, a: &Attempt, live: &Live, step: u32) -> Reason {
+fn works(view: &FleetProjection, now: &Now, a: &Attempt, live: &Live, step: u32) -> Reason {
     let robot_id = &a.robot_id;
     let since = Utc(now.utc.0 - i64::try_from(now.site.since(live.progress_at).as_ms()).unwrap_or(0));
     let since = a.accepted.map_or(since, |accepted| since.max(accepted));
@@ -168,7 +174,7 @@ fn unknown(a: &Attempt, live: Option<&std::sync::Arc<Live>>) -> Option<Reason> {
 }
 
 /// What keeps a robot that has work from going on, apart from places.
-fn check_goes_on(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Result<(), Reason> {
+fn check_goes_on(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotId) -> Result<(), Reason> {
     match liveness::presence(board, robot_id, now) {
         Presence::Online => {}
         Presence::Suspect => return Err(Code::RobotSuspect.into()),
@@ -251,7 +257,7 @@ pub fn about_robot(reason: Reason, robot_id: &RobotId) -> Reason {
 }
 
 /// Why a robot that was given away, to an attempt or a drain, does not go on, or what it does. None: it has no work, or nobody can say.
-pub fn of_robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Option<Reason> {
+pub fn of_robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotId) -> Option<Reason> {
     match &view.authority.get(robot_id.as_str())?.row.holder {
         RobotHolder::None => None,
         RobotHolder::Attempt(id) => of_attempt(view, board, now, view.attempt(id)?),
@@ -264,7 +270,7 @@ pub fn of_robot(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Op
 
 /// Which places the robot waits for, and what is in the way: a place that is closed, holders of one without a free seat, robots that start
 /// there, a stop, whoever came first, an area that is full, or a free seat that others go to first. None: it waits for none.
-pub fn place_wait(view: &View, robot_id: &RobotId) -> Option<Reason> {
+pub fn place_wait(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> {
     let wait = view.waits.get(robot_id)?;
     let mut reason = Reason::from(Code::PlaceBlocked);
     for (key, told, who) in in_the_way(view, robot_id, &wait.places) {
@@ -289,7 +295,7 @@ pub fn place_wait(view: &View, robot_id: &RobotId) -> Option<Reason> {
 
 /// What may be in the way of a robot to places, by the fact that names it: the first that is there is told.
 fn in_the_way(
-    view: &View,
+    view: &FleetProjection,
     robot_id: &RobotId,
     places: &[PlaceId],
 ) -> [(&'static str, &'static str, BTreeSet<String>); 7] {

@@ -7,7 +7,7 @@ use super::standing;
 use crate::fleet::assignment::filters;
 use crate::fleet::decision::plan::Plan;
 use crate::fleet::projection::liveness::Board;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::task::{Phase, TaskState};
@@ -16,7 +16,7 @@ use std::collections::BTreeMap;
 use std::ops::Bound;
 
 /// Looks at the next robots and tasks.
-pub(in crate::fleet) fn count_unexplained(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
+pub(in crate::fleet) fn count_unexplained(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan) {
     let mut found: Vec<(String, bool)> = Vec::new();
     let robots = next(&view.authority, &view.unexplained.robot);
     for id in &robots {
@@ -34,7 +34,7 @@ pub(in crate::fleet) fn count_unexplained(view: &mut View, board: &Board, now: N
     plan.slice.look(robots.len() + tasks.len() * (1 + idle.len()));
     (view.unexplained.robot, view.unexplained.task) =
         (robots.into_iter().next_back().unwrap_or_default(), tasks.into_iter().next_back().unwrap_or_default());
-    let is_known = |view: &View, key: &str| match key.split_once(' ') {
+    let is_known = |view: &FleetProjection, key: &str| match key.split_once(' ') {
         Some(("task", id)) => view.tasks.contains_key(id),
         Some((_, id)) => view.authority.contains_key(id),
         None => false,
@@ -62,7 +62,7 @@ fn next<R>(rows: &BTreeMap<String, R>, last: &str) -> Vec<String> {
 }
 
 /// A task has a reason, or waits for robots that all have one against it: none that is idle could take it.
-fn is_explained(view: &View, board: &Board, now: &Now, task: &TaskState, idle: &[&RobotId]) -> bool {
+fn is_explained(view: &FleetProjection, board: &Board, now: &Now, task: &TaskState, idle: &[&RobotId]) -> bool {
     let Some(intake) = view.intake(&task.task_id) else { return true };
     match standing::of_task(view, board, now, task, intake) {
         Some(why) => standing::is_told(&why),

@@ -12,7 +12,7 @@
 use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::RobotControl;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -115,7 +115,7 @@ pub fn answered(tx: &mut Tx, robot_id: &RobotId) {
 ///
 /// # Errors
 /// If so.
-pub fn screen(view: &View, robot_id: &RobotId, now: &Now) -> Result<(), Reason> {
+pub fn screen(view: &FleetProjection, robot_id: &RobotId, now: &Now) -> Result<(), Reason> {
     let since = view.control.get(robot_id.as_str()).and_then(|c| c.row.unanswered_since);
     if let Some(since) = since.filter(|since| now.ms_since(*since) < limits::BREAKER_WINDOW.as_ms()) {
         let left_ms = limits::BREAKER_WINDOW.as_ms() - now.ms_since(since);
@@ -137,8 +137,8 @@ mod tests {
     use crate::time::LinkTime;
     use std::sync::Arc;
 
-    fn view() -> View {
-        View::new(Arc::new(text::parse(CORRIDOR).expect("reads")), Now::default(), Now::default())
+    fn view() -> FleetProjection {
+        FleetProjection::new(Arc::new(text::parse(CORRIDOR).expect("reads")), Now::default(), Now::default())
     }
 
     fn robot(n: usize) -> RobotId {
@@ -149,12 +149,12 @@ mod tests {
         Now { link: LinkTime(secs * 1_000), utc: crate::time::Utc(secs as i64 * 1_000), ..Now::default() }
     }
 
-    fn miss(view: &mut View, n: usize, secs: u64) {
+    fn miss(view: &mut FleetProjection, n: usize, secs: u64) {
         let mut tx = Tx::new(view, at(secs), "tests");
         missed(&mut tx, &robot(n));
     }
 
-    fn code(view: &View, n: usize, secs: u64) -> Option<Code> {
+    fn code(view: &FleetProjection, n: usize, secs: u64) -> Option<Code> {
         screen(view, &robot(n), &at(secs)).err().map(|reason| reason.code)
     }
 

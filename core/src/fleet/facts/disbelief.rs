@@ -5,7 +5,7 @@
 
 use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Tx;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::errand_reports;
 use crate::fleet::tasks::transitions::{self, News, happen};
 use crate::ids::{AttemptId, PlaceId, RobotId, TaskId};
@@ -28,7 +28,13 @@ pub fn disbelieve(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, place
     transitions::release(tx, robot_id, &report);
 }
 
-fn told(view: &View, robot_id: &RobotId, report: &AttemptReport, task_id: &TaskId, place_id: &PlaceId) -> Reason {
+fn told(
+    view: &FleetProjection,
+    robot_id: &RobotId,
+    report: &AttemptReport,
+    task_id: &TaskId,
+    place_id: &PlaceId,
+) -> Reason {
     let what = if report.state == WorkState::Succeeded { "" } else { "a part of " };
     let is_canceled = view.task(task_id).is_some_and(transitions::wants_cancel);
     let answer = format!(", then `midshift task resolve {task_id} --as ANSWER --reason TEXT`");
@@ -52,7 +58,7 @@ fn incident_of(robot_id: &RobotId) -> String {
 ///
 /// # Errors
 /// If so; the reason says what it said.
-pub fn screen(view: &View, robot_id: &RobotId) -> Result<(), Reason> {
+pub fn screen(view: &FleetProjection, robot_id: &RobotId) -> Result<(), Reason> {
     let incident = view.incidents.get(&incident_of(robot_id)).map(|i| &i.row);
     match incident.filter(|i| i.closed.is_none()) {
         Some(open) => Err(open.reason.clone()),

@@ -8,7 +8,7 @@ use crate::fleet::decision::plan::{Plan, Tx, mark};
 use crate::fleet::projection::index;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::FleetMark;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::arrivals;
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
@@ -22,7 +22,7 @@ use std::collections::BTreeMap;
 pub const LOGS: &[Log] = &[Log::Task, Log::Fleet, Log::Telemetry, Log::RobotInbox, Log::Ota, Log::Stop, Log::Identity];
 
 /// Takes entries of the feed, in commit order: rows into the view, requests and robots' events into decisions.
-pub fn absorb(view: &mut View, now: Now, board: &Board, entries: &[Entry], plan: &mut Plan) {
+pub fn absorb(view: &mut FleetProjection, now: Now, board: &Board, entries: &[Entry], plan: &mut Plan) {
     let consumed = view.marks.get("fleet").map_or(Seq(0), |m| m.row.seq);
     for entry in entries {
         take_row(view, entry, &mut plan.report.unreadable);
@@ -92,10 +92,10 @@ pub fn absorb(view: &mut View, now: Now, board: &Board, entries: &[Entry], plan:
     }
 }
 
-fn take_row(view: &mut View, entry: &Entry, unreadable: &mut Vec<String>) {
+fn take_row(view: &mut FleetProjection, entry: &Entry, unreadable: &mut Vec<String>) {
     if let Some(table) = entry.table.filter(|_| entry.seq > view.read_at) {
         let key = crate::rows::Key { table, id: entry.subject.clone() };
-        if let Err(error) = view.absorb(&key, entry.revision, crate::picture::row_of(entry, table).as_ref()) {
+        if let Err(error) = view.absorb(&key, entry.revision, crate::projection::row_of(entry, table).as_ref()) {
             unreadable.push(error.to_string());
         }
         view.refused.row_changed(&key);
@@ -104,7 +104,7 @@ fn take_row(view: &mut View, entry: &Entry, unreadable: &mut Vec<String>) {
 }
 
 /// Takes entries of the feed as somebody does who decides nothing: rows only. What a planner would have to look at is not gathered.
-pub fn follow_rows(view: &mut View, now: Now, entries: &[Entry], unreadable: &mut Vec<String>) {
+pub fn follow_rows(view: &mut FleetProjection, now: Now, entries: &[Entry], unreadable: &mut Vec<String>) {
     for entry in entries {
         take_row(view, entry, unreadable);
         if entry.table == Some(Table::ServiceClock) {
@@ -120,18 +120,18 @@ pub fn follow_rows(view: &mut View, now: Now, entries: &[Entry], unreadable: &mu
 ///
 /// # Errors
 /// A row that cannot be read.
-pub fn reread(view: &mut View, keys: &[Key], rows: &[Row]) -> Result<(), BadRow> {
+pub fn reread(view: &mut FleetProjection, keys: &[Key], rows: &[Row]) -> Result<(), BadRow> {
     put_right(view, keys, rows)?;
     view.rest();
     Ok(())
 }
 
-/// Puts rows as they were just read over what was to become of `keys`; other rows are those that [`named`](crate::fleet::projection::named) names, which this picture
+/// Puts rows as they were just read over what was to become of `keys`; other rows are those that [`named`](crate::fleet::projection::named) names, which this projection
 /// may have let go.
 ///
 /// # Errors
 /// A row that cannot be read.
-pub fn put_right(view: &mut View, keys: &[Key], rows: &[Row]) -> Result<(), BadRow> {
+pub fn put_right(view: &mut FleetProjection, keys: &[Key], rows: &[Row]) -> Result<(), BadRow> {
     let found: BTreeMap<&Key, &Row> = rows.iter().map(|row| (&row.key, row)).collect();
     for key in keys {
         view.put_right(key, found.get(key).copied())?;
@@ -147,7 +147,7 @@ fn pass_over(tx: &mut Tx, entry: &Entry) {
 }
 
 /// An entry of the inbox that is not obeyed may have said where its robot was.
-fn lose_word(view: &mut View, now: Now, entry: &Entry, plan: &mut Plan) {
+fn lose_word(view: &mut FleetProjection, now: Now, entry: &Entry, plan: &mut Plan) {
     if let Some(robot_id) = RobotId::parse(&entry.subject).ok().filter(|_| entry.log == Log::RobotInbox) {
         plan.decide(view, now, "fleet", |tx| arrivals::lost(tx, &robot_id));
     }
@@ -155,7 +155,7 @@ fn lose_word(view: &mut View, now: Now, entry: &Entry, plan: &mut Plan) {
 
 /// The entry of the feed that an item obeys: the mark it writes.
 pub fn obeyed(item: &Item) -> Option<Seq> {
-    crate::picture::written::<FleetMark>(item).map(|mark| mark.seq)
+    crate::projection::written::<FleetMark>(item).map(|mark| mark.seq)
 }
 
 /// Kind of the fact that a second machine has attached with a robot's name, stated by telemetry.

@@ -9,7 +9,7 @@ use crate::fleet::decision::plan::Tx;
 use crate::fleet::decision::report::Tally;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::HolderState;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::transitions::{News, event_of, happen, release};
 use crate::fleet::tasks::{arrivals, breaker, claims, errand_reports, plausible};
 use crate::ids::{PlaceId, RobotId};
@@ -64,7 +64,7 @@ pub fn obey_entry(tx: &mut Tx, entry: &InboxEntry, board: &Board, tally: &mut Ta
 }
 
 /// An offer stands, and its robot says that it is over without having taken or refused it.
-fn calls_offer_over(view: &View, robot_id: &RobotId, report: &AttemptReport) -> bool {
+fn calls_offer_over(view: &FleetProjection, robot_id: &RobotId, report: &AttemptReport) -> bool {
     let attempt = view.attempt(&report.attempt).filter(|a| a.robot_id == *robot_id);
     let stands = attempt.is_some_and(|a| a.phase == AttemptPhase::Offered && a.uncertain.is_none());
     stands && matches!(report.state, WorkState::Aborted | WorkState::Suspended)

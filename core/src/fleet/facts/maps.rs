@@ -7,7 +7,7 @@
 use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::rows::Place;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{PlaceId, RobotId, TaskId, WaypointId};
 use crate::reason::{Code, Reason};
 use crate::site::{Site, WaypointIx, read_stored};
@@ -72,7 +72,7 @@ impl MapChange {
 
 /// Why a process that begins to plan must not write its map, which `view` stands on, over the stored one: this is another one than at its
 /// start, or something is in the way now that was not when it chose. It chooses anew in its next start.
-pub fn outdated(view: &View, site_text: &str, at_start: Option<&str>, change: &MapChange) -> Option<Reason> {
+pub fn outdated(view: &FleetProjection, site_text: &str, at_start: Option<&str>, change: &MapChange) -> Option<Reason> {
     let stored = view.sites.get(view.site.site_id().as_str()).map(|s| &s.row).filter(|row| row.text != site_text)?;
     let reason = |obstacles: &[Obstacle]| not_taken(&stored.map_version, view.site.map_version(), obstacles);
     if at_start != Some(stored.text.as_str()) {
@@ -86,7 +86,7 @@ pub fn outdated(view: &View, site_text: &str, at_start: Option<&str>, change: &M
 }
 
 /// What is in the way of `new` by the rows of `view`, which were written by the stored map.
-pub fn in_the_way(view: &View, stored: &Site, new: &Site) -> Vec<Obstacle> {
+pub fn in_the_way(view: &FleetProjection, stored: &Site, new: &Site) -> Vec<Obstacle> {
     let differs = |name: &WaypointId| point(stored, name) != point(new, name);
     let goes_there = |id: &TaskId| view.intake(id).is_some_and(|intake| intake.spec.goals(0).any(differs));
     let live = view.tasks.values().map(|task| &task.row).filter(|task| !task.phase.is_terminal());
@@ -131,7 +131,7 @@ fn holds(stored: &Site, new: &Site, row: &Place) -> bool {
 }
 
 /// The robot says that it drives by another map than the one that is planned on.
-pub fn differs(view: &View, live: &Live) -> Option<Reason> {
+pub fn differs(view: &FleetProjection, live: &Live) -> Option<Reason> {
     let (own, ours) = (&live.report.map_version, view.site.map_version());
     let reason = || Reason::from(Code::MapDiffers).with("robot_map", own).with("map_version", ours);
     (!own.is_empty() && own != ours).then(reason)
@@ -149,7 +149,7 @@ pub(in crate::fleet) fn compare(tx: &mut Tx, live: &Live) {
 }
 
 /// Tells people of what became of the map.
-pub(in crate::fleet) fn tell_of_change(view: &mut View, now: Now, change: &MapChange, plan: &mut Plan) {
+pub(in crate::fleet) fn tell_of_change(view: &mut FleetProjection, now: Now, change: &MapChange, plan: &mut Plan) {
     let id = format!("{}:{}", Code::MapNotTaken, view.site.site_id());
     let open = view.incidents.get(&id).map(|i| &i.row).filter(|i| i.closed.is_none()).map(|i| i.reason.clone());
     if let MapChange::NotTaken { version, obstacles } = change {

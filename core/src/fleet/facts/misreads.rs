@@ -8,7 +8,7 @@
 use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Plan;
 use crate::fleet::projection::liveness::{self, Board};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -16,14 +16,19 @@ use crate::robot::Presence;
 use crate::time::{Now, Utc};
 
 /// Open incidents of this kind: whose, since when, why.
-fn open(view: &View) -> impl Iterator<Item = (&RobotId, Utc, &Reason)> {
+fn open(view: &FleetProjection) -> impl Iterator<Item = (&RobotId, Utc, &Reason)> {
     let incidents = view.incidents.values().map(|i| &i.row);
     let open = incidents.filter(|i| i.closed.is_none() && i.reason.code == Code::RobotNotUnderstood);
     open.filter_map(|i| Some((i.robot_id.as_ref()?, i.opened, &i.reason)))
 }
 
 /// Why a robot that is not heard is not; none: nobody knows, or it is heard.
-pub(in crate::fleet) fn unheard(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Option<Reason> {
+pub(in crate::fleet) fn unheard(
+    view: &FleetProjection,
+    board: &Board,
+    now: &Now,
+    robot_id: &RobotId,
+) -> Option<Reason> {
     if liveness::presence(board, robot_id, now) == Presence::Online {
         return None;
     }
@@ -31,8 +36,8 @@ pub(in crate::fleet) fn unheard(view: &View, board: &Board, now: &Now, robot_id:
 }
 
 /// Closes what is over.
-pub(in crate::fleet) fn close_understood(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
-    let seen: &View = view;
+pub(in crate::fleet) fn close_understood(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan) {
+    let seen: &FleetProjection = view;
     let over: Vec<RobotId> = open(seen)
         .filter(|(robot_id, opened, _)| is_understood(seen, board, &now, robot_id, *opened))
         .map(|(robot_id, ..)| robot_id.clone())
@@ -45,7 +50,7 @@ pub(in crate::fleet) fn close_understood(view: &mut View, board: &Board, now: No
 }
 
 /// Its newest heartbeat is of after the incident, and of a session that has stood for long.
-fn is_understood(view: &View, board: &Board, now: &Now, robot_id: &RobotId, opened: Utc) -> bool {
+fn is_understood(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotId, opened: Utc) -> bool {
     let session = view.sessions.get(robot_id.as_str()).map(|s| s.row.session_epoch);
     let Some(live) = board.get(robot_id).filter(|live| session == Some(live.report.session_epoch)) else {
         return false;

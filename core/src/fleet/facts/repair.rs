@@ -9,7 +9,7 @@ use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::decision::report::Tally;
 use crate::fleet::projection::liveness::{Board, is_fresh, is_settled, lease_stands, presence};
 use crate::fleet::projection::memory::Attached;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::claims::{PLACES, differences, excess, implausible};
 use crate::fleet::tasks::transitions::{self, News, happen, may_suspend};
 use crate::fleet::tasks::{arrivals, errand_reports, load, plausible};
@@ -23,7 +23,7 @@ use crate::time::Now;
 use crate::work::{AttemptReport, Live, PlaceNews, WorkState};
 
 /// Counts the time in which the robot is heard.
-fn attached(view: &mut View, robot_id: &RobotId, board: &Board, now: &Now) {
+fn attached(view: &mut FleetProjection, robot_id: &RobotId, board: &Board, now: &Now) {
     let heard = presence(board, robot_id, now) == Presence::Online;
     let fresh = Attached { ms: 0, until: now.site, is_heard: heard };
     let time = view.attached.entry(robot_id.clone()).or_insert(fresh);
@@ -35,14 +35,14 @@ fn attached(view: &mut View, robot_id: &RobotId, board: &Board, now: &Now) {
 }
 
 /// Whether there is something to compare: a newer heartbeat, one that could not count yet, or none for too long.
-pub fn is_due(view: &View, robot_id: &RobotId, board: &Board, now: &Now) -> bool {
+pub fn is_due(view: &FleetProjection, robot_id: &RobotId, board: &Board, now: &Now) -> bool {
     let online = presence(board, robot_id, now) == Presence::Online;
     let newest = board.get(robot_id).map(|l| (l.report.session_epoch, l.report.hb));
     !online || newest.is_none() || view.compared.get(robot_id) != newest.as_ref()
 }
 
 /// Repairs one robot, in items that each stay below their limits however long the robot's lists are.
-pub fn robot(view: &mut View, now: Now, robot_id: &RobotId, board: &Board, plan: &mut Plan) {
+pub fn robot(view: &mut FleetProjection, now: Now, robot_id: &RobotId, board: &Board, plan: &mut Plan) {
     attached(view, robot_id, board, &now);
     let mut tally = plan.report.tally;
     plan.decide(view, now, "fleet", |tx| {
@@ -65,7 +65,7 @@ pub fn robot(view: &mut View, now: Now, robot_id: &RobotId, board: &Board, plan:
 }
 
 /// Compares the rows with a heartbeat, if its differences count.
-fn compare(view: &mut View, now: Now, live: &Live, tally: &mut Tally, plan: &mut Plan) {
+fn compare(view: &mut FleetProjection, now: Now, live: &Live, tally: &mut Tally, plan: &mut Plan) {
     if !is_settled(view, live) || !is_fresh(view, live) {
         tally.pending += 1;
         return;
@@ -200,7 +200,7 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
 }
 
 /// The robot heard the offer and lists no answer: the offer stands, or was taken back only because nobody answered it.
-fn is_unanswered(view: &View, a: &Attempt, live: &Live) -> bool {
+fn is_unanswered(view: &FleetProjection, a: &Attempt, live: &Live) -> bool {
     let task = a.attempt.subject.task_id().and_then(|id| view.task(id));
     let ran_out = task.and_then(|t| t.reason.as_ref()).is_some_and(|r| r.code == Code::OfferNotAnswered);
     let waits = a.phase == AttemptPhase::Offered || (a.phase == AttemptPhase::Stopping && ran_out);
@@ -228,7 +228,7 @@ fn unknown(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
 }
 
 /// The first attempt that a robot lists as its own and that does not hold it; what a person disowned does not count.
-pub fn unknown_attempt<'l>(view: &View, live: &'l Live) -> Option<&'l AttemptId> {
+pub fn unknown_attempt<'l>(view: &FleetProjection, live: &'l Live) -> Option<&'l AttemptId> {
     let holder = view.held_by(&live.robot_id);
     let disowned = view.control.get(live.robot_id.as_str()).map(|c| c.row.disowned.as_slice()).unwrap_or_default();
     let mine = live.report.attempts.iter().filter(|r| !r.state.is_over()).map(|r| &r.attempt);
@@ -288,7 +288,7 @@ fn stalled(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
 }
 
 /// Brings place rows to what a settled robot reports: entered, gone, or standing somewhere nobody knew of. What is not `sound` frees nothing.
-fn repair_places(view: &mut View, now: Now, live: &Live, sound: bool, plan: &mut Plan) {
+fn repair_places(view: &mut FleetProjection, now: Now, live: &Live, sound: bool, plan: &mut Plan) {
     let robot_id = &live.robot_id;
     let excess = excess(view, live);
     let mut changes = differences(view, live);

@@ -4,7 +4,7 @@ use super::holds::holds_changed;
 use super::stops;
 use crate::fleet::decision::plan::{Plan, Tx, mark};
 use crate::fleet::projection::rows::HoldToken;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::transitions::{News, happen};
 use crate::fleet::traffic::places;
 use crate::ids::{AreaId, RobotId, TaskId};
@@ -16,7 +16,13 @@ use crate::time::Now;
 
 /// Obeys one request. The mark that it was obeyed goes with the last item: what was lost on the way is done again. False: the store would
 /// never take it.
-pub fn obey_request(view: &mut View, now: Now, request: &TaskRequest, entry: &Entry, plan: &mut Plan) -> bool {
+pub fn obey_request(
+    view: &mut FleetProjection,
+    now: Now,
+    request: &TaskRequest,
+    entry: &Entry,
+    plan: &mut Plan,
+) -> bool {
     let resumes = match &request.ask {
         Ask::ResumeHeld { stop_id, area_id, task_ids, robot_ids } => {
             resumes(view, stop_id.as_deref(), area_id.as_ref(), task_ids, robot_ids)
@@ -107,7 +113,7 @@ enum Resume {
 
 /// What a resume lets go: `resume:` tokens of the robots and tasks that are named, or that stand in the area.
 fn resumes(
-    view: &View,
+    view: &FleetProjection,
     stop_id: Option<&str>,
     area_id: Option<&AreaId>,
     task_ids: &[TaskId],

@@ -8,7 +8,7 @@ use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{HoldToken, RobotControl};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::traffic::engaged_stops::{self, over};
 use crate::ids::{RobotId, StopId};
 use crate::limits;
@@ -45,7 +45,7 @@ impl Hold {
 }
 
 /// Puts right the tokens of every robot that a stop or its own report concerns.
-pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
+pub fn plan(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan) {
     let all = std::mem::take(&mut view.stops_changed);
     if all {
         open_incidents(view, now, plan);
@@ -74,7 +74,7 @@ pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
 }
 
 /// Opens one incident for each stop by which the stop service says that it began without its memory.
-fn open_incidents(view: &mut View, now: Now, plan: &mut Plan) {
+fn open_incidents(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     let is_told = |stop_id: &StopId| {
         let told = view.incidents.values().map(|i| &i.row.reason).filter(|reason| reason.code == Code::StopMemoryLost);
         told.filter_map(|reason| reason.metadata.get("stop_id")).any(|told| *told == stop_id.as_str())

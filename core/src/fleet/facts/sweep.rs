@@ -6,7 +6,7 @@ use super::repair;
 use crate::fleet::decision::plan::Plan;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::memory::Agenda;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::timers;
 use crate::fleet::tasks::transitions::{News, happen};
 use crate::fleet::traffic::desired;
@@ -17,7 +17,7 @@ use crate::time::Now;
 use std::collections::BTreeSet;
 
 /// Gathers what is due. Robots that wait from the period before still do.
-pub(in crate::fleet) fn gather(view: &mut View, now: Now, board: &Board) {
+pub(in crate::fleet) fn gather(view: &mut FleetProjection, now: Now, board: &Board) {
     let (timers, late) = timers::due(view, &now);
     let suspended = view.tasks.values().filter(|t| t.row.phase == Phase::Suspended).map(|t| t.row.task_id.clone());
     let suspended = suspended.collect();
@@ -30,7 +30,12 @@ pub(in crate::fleet) fn gather(view: &mut View, now: Now, board: &Board) {
 }
 
 /// Does what a slice holds of what is due; gives back the robots that were compared with the rows.
-pub(in crate::fleet) fn carry_out(view: &mut View, now: Now, board: &Board, plan: &mut Plan) -> BTreeSet<RobotId> {
+pub(in crate::fleet) fn carry_out(
+    view: &mut FleetProjection,
+    now: Now,
+    board: &Board,
+    plan: &mut Plan,
+) -> BTreeSet<RobotId> {
     let mut compared = BTreeSet::new();
     while let Some(robot_id) = view.agenda.heard.first().filter(|_| !plan.is_cut()).cloned() {
         view.agenda.heard.remove(&robot_id);

@@ -11,7 +11,7 @@ use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::objects;
 use crate::fleet::projection::rows::{AreaBudget, Drain, DrainState, RobotHolder};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{AreaId, RobotId};
 use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::policy::AreaPolicy;
@@ -37,7 +37,7 @@ struct Area {
 
 impl Area {
     /// Robots in work that are heard and have the capability. Counted once for all drains that wait.
-    fn able(&mut self, view: &View, board: &Board, now: &Now, capability: &str) -> usize {
+    fn able(&mut self, view: &FleetProjection, board: &Board, now: &Now, capability: &str) -> usize {
         if let Some(count) = self.able.get(capability) {
             return *count;
         }
@@ -48,7 +48,7 @@ impl Area {
     }
 
     /// One more is out of work.
-    fn take(&mut self, view: &View, board: &Board, now: &Now, robot_id: &RobotId) {
+    fn take(&mut self, view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotId) {
         self.draining.insert(robot_id.clone());
         if self.off_work.insert(robot_id.clone()) && self.robots.contains(robot_id) {
             for (capability, count) in &mut self.able {
@@ -58,12 +58,12 @@ impl Area {
     }
 }
 
-fn has(view: &View, robot_id: &RobotId, capability: &str) -> bool {
+fn has(view: &FleetProjection, robot_id: &RobotId, capability: &str) -> bool {
     let session = view.sessions.get(robot_id.as_str());
     session.is_some_and(|s| s.row.inventory.capabilities.iter().any(|c| c == capability))
 }
 
-fn is_able(view: &View, board: &Board, now: &Now, robot_id: &RobotId, capability: &str) -> bool {
+fn is_able(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotId, capability: &str) -> bool {
     has(view, robot_id, capability) && liveness::presence(board, robot_id, now) == Presence::Online
 }
 
@@ -74,7 +74,7 @@ fn is_same(known: &Reason, why: &Reason) -> bool {
 }
 
 /// Lets waiting drains begin as far as the areas' rules allow, and keeps the areas' rows.
-pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
+pub fn plan(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan) {
     let waits = |d: &&Drain| d.state == DrainState::Waiting && !view.drain_releases.contains_key(d.drain_id.as_str());
     let mut waiting: Vec<Drain> = view.drains.values().map(|d| &d.row).filter(waits).cloned().collect();
     if waiting.is_empty() && view.budgets.is_empty() {
@@ -136,13 +136,13 @@ fn put_row(tx: &mut Tx, area_id: &AreaId, area: &Area) {
     tx.put(row, "area.off_work");
 }
 
-fn row_of(view: &View, area_id: &AreaId, area: &Area) -> AreaBudget {
+fn row_of(view: &FleetProjection, area_id: &AreaId, area: &Area) -> AreaBudget {
     let most = view.policy(area_id).software.off_work_max(area.robots.len()) as u32;
     AreaBudget { area_id: area_id.clone(), off_work: area.off_work.clone(), most }
 }
 
 /// Rows of areas whose robots came back, or were taken out by a person or the breaker.
-fn keep_rows(view: &mut View, now: Now, areas: &BTreeMap<AreaId, Area>, plan: &mut Plan) {
+fn keep_rows(view: &mut FleetProjection, now: Now, areas: &BTreeMap<AreaId, Area>, plan: &mut Plan) {
     let none = Area::default();
     let known: Vec<AreaId> = view.budgets.values().map(|b| b.row.area_id.clone()).collect();
     for area_id in known {
@@ -158,7 +158,7 @@ fn keep_rows(view: &mut View, now: Now, areas: &BTreeMap<AreaId, Area>, plan: &m
 }
 
 /// What it costs to take a robot out of work now: nothing while it charges, little while it has nothing to do.
-fn cost(view: &View, robot_id: &RobotId) -> u8 {
+fn cost(view: &FleetProjection, robot_id: &RobotId) -> u8 {
     let holder = view.authority.get(robot_id.as_str()).map(|a| &a.row.holder);
     match holder {
         Some(RobotHolder::Attempt(id)) => match view.attempt(id).and_then(|a| a.errand) {
@@ -170,7 +170,7 @@ fn cost(view: &View, robot_id: &RobotId) -> u8 {
     }
 }
 
-fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
+fn areas(view: &FleetProjection, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
     let mut areas: BTreeMap<AreaId, Area> = BTreeMap::new();
     for robot_id in board.keys().filter(|id| liveness::presence(board, id, now) != Presence::Offline) {
         let Some(area_id) = objects::area_of(view, board, robot_id) else { continue };
@@ -199,7 +199,7 @@ fn areas(view: &View, board: &Board, now: &Now) -> BTreeMap<AreaId, Area> {
 }
 
 /// The robot is not heard, and a person or its roll-out's policy said that it counts in no budget until it is.
-fn is_written_off(view: &View, board: &Board, now: &Now, drain: &Drain) -> bool {
+fn is_written_off(view: &FleetProjection, board: &Board, now: &Now, drain: &Drain) -> bool {
     let said = view.drain_requests.get(drain.drain_id.as_str()).is_some_and(|request| request.row.written_off);
     said && liveness::presence(board, &drain.robot_id, now) == Presence::Offline
 }
@@ -212,14 +212,21 @@ fn comes_to_an_end(board: &Board, now: &Now, robot_id: &RobotId) -> bool {
 }
 
 /// Why a robot that changes to something new does not leave its work now, however many are out of it.
-fn shut(view: &View, now: &Now, area_id: &AreaId, drain: &Drain) -> Option<Reason> {
+fn shut(view: &FleetProjection, now: &Now, area_id: &AreaId, drain: &Drain) -> Option<Reason> {
     let forward = view.drain_requests.get(drain.drain_id.as_str()).is_some_and(|request| request.row.forward);
     let shut = forward && !view.policy(area_id).software.is_open(now);
     shut.then(|| Reason::from(Code::BlockedByWindow).with("area_id", area_id))
 }
 
 /// Why one more robot may not leave its work now.
-fn refusal(view: &View, board: &Board, now: &Now, area_id: &AreaId, area: &mut Area, drain: &Drain) -> Option<Reason> {
+fn refusal(
+    view: &FleetProjection,
+    board: &Board,
+    now: &Now,
+    area_id: &AreaId,
+    area: &mut Area,
+    drain: &Drain,
+) -> Option<Reason> {
     let robot_id = &drain.robot_id;
     if area.off_work.contains(robot_id) || view.bugs.budget_is_forgotten() {
         return None;

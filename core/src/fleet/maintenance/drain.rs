@@ -9,7 +9,7 @@ use crate::fleet::assignment::errands;
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{Drain, DrainState, RobotAuthority, RobotHolder};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::transitions::{self, News};
 use crate::fleet::tasks::{eligibility, errand_reports, load};
 use crate::fleet::traffic::routing;
@@ -70,7 +70,7 @@ fn give_back(tx: &mut Tx, robot_id: &RobotId, drain_id: &DrainId) {
 
 /// Takes what the rollout service asks for and what it lets go. Both rows are relied upon: it takes a request away only while there is
 /// no drain, and a drain is made only while the request stands alone.
-pub fn obey(view: &mut View, now: Now, plan: &mut Plan) {
+pub fn obey(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     let released: Vec<(RobotId, DrainId)> = (view.drain_releases.keys())
         .filter_map(|id| view.drains.get(id))
         .map(|d| (d.row.robot_id.clone(), d.row.drain_id.clone()))
@@ -114,7 +114,7 @@ pub fn obey(view: &mut View, now: Now, plan: &mut Plan) {
 }
 
 /// Brings every drain a step further.
-pub fn plan(view: &mut View, board: &Board, now: Now, plan: &mut Plan) {
+pub fn plan(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan) {
     let open: Vec<Drain> =
         view.drains.values().map(|d| &d.row).filter(|d| d.state == DrainState::Draining).cloned().collect();
     for drain in open {
@@ -169,7 +169,7 @@ fn further(tx: &mut Tx, drain: &Drain, board: &Board) {
 }
 
 /// Milliseconds of site time that the rest of a task will take, as far as one can tell.
-fn rest_ms(view: &View, task_id: &crate::ids::TaskId, live: &Live) -> u64 {
+fn rest_ms(view: &FleetProjection, task_id: &crate::ids::TaskId, live: &Live) -> u64 {
     let Some((task, intake)) = view.task(task_id).zip(view.intake(task_id)) else { return 0 };
     let done = live.report.attempts.iter().map(|a| a.step_index).max().unwrap_or(task.next_step) as usize;
     let steps = &intake.spec.steps;
@@ -184,7 +184,7 @@ fn rest_ms(view: &View, task_id: &crate::ids::TaskId, live: &Live) -> u64 {
 }
 
 /// The robot stands where it may stand for long, and what it says is newer than what it last did. One that was never heard rests too.
-fn is_at_rest(view: &View, drain: &Drain, live: Option<&Live>) -> bool {
+fn is_at_rest(view: &FleetProjection, drain: &Drain, live: Option<&Live>) -> bool {
     let Some(live) = live else { return true };
     let Some(here) = routing::find(view, live.report.vitals.waypoint.as_ref()) else { return false };
     let idle = live.report.attempts.iter().all(|a| a.state.is_over()) && live.report.vitals.speed_mm_s == 0;
@@ -192,7 +192,7 @@ fn is_at_rest(view: &View, drain: &Drain, live: Option<&Live>) -> bool {
 }
 
 /// The robot holds the standing place it is in, and nobody works there. Where bodies may drive through each other it may rest anywhere.
-fn may_rest(view: &View, robot_id: &RobotId, here: WaypointIx) -> bool {
+fn may_rest(view: &FleetProjection, robot_id: &RobotId, here: WaypointIx) -> bool {
     if !view.site.collisions_modelled() {
         return true;
     }

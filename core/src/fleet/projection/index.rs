@@ -5,16 +5,16 @@
 
 use super::queue::{TASKS_PER_TURN, Wait};
 use super::rows::{Drain, HoldToken, Incident, Place, RobotAuthority, RobotControl};
-use super::state::View;
+use super::state::FleetProjection;
 use crate::ids::{RobotId, TaskId};
-use crate::picture::Indexed;
 use crate::policy::AreaPolicy;
+use crate::projection::Indexed;
 use crate::stop::record::StopRecord;
 use crate::task::{Attempt, Phase, TaskIntake, TaskState};
 use crate::time::Utc;
 use crate::work::Session;
 
-impl Indexed<TaskState> for View {
+impl Indexed<TaskState> for FleetProjection {
     fn changed(view: &mut Self, id: &str, _old: Option<&TaskState>) {
         let Ok(task_id) = TaskId::parse(id) else { return };
         if let Some(task) = view.tasks.get(id).map(|t| &t.row) {
@@ -35,7 +35,7 @@ impl Indexed<TaskState> for View {
     }
 }
 
-impl Indexed<TaskIntake> for View {
+impl Indexed<TaskIntake> for FleetProjection {
     fn changed(view: &mut Self, id: &str, old: Option<&TaskIntake>) {
         let waits_for = view.intakes.get(id).map(|i| i.row.spec.depends_on.clone()).unwrap_or_default();
         for task_id in waits_for {
@@ -56,7 +56,7 @@ impl Indexed<TaskIntake> for View {
     }
 }
 
-impl Indexed<AreaPolicy> for View {
+impl Indexed<AreaPolicy> for FleetProjection {
     /// Whoever put it, this process or another: every robot hears of it.
     fn changed(view: &mut Self, _id: &str, _old: Option<&AreaPolicy>) {
         let robots: Vec<RobotId> = view.sessions.values().map(|s| s.row.robot_id.clone()).collect();
@@ -64,7 +64,7 @@ impl Indexed<AreaPolicy> for View {
     }
 }
 
-impl Indexed<Incident> for View {
+impl Indexed<Incident> for FleetProjection {
     /// A person has looked: what was put aside is tried again.
     fn changed(view: &mut Self, id: &str, _old: Option<&Incident>) {
         if let Some(closed) = view.incidents.get(id).map(|i| &i.row).filter(|i| i.closed.is_some()) {
@@ -73,7 +73,7 @@ impl Indexed<Incident> for View {
     }
 }
 
-impl Indexed<StopRecord> for View {
+impl Indexed<StopRecord> for FleetProjection {
     fn changed(view: &mut Self, id: &str, _old: Option<&StopRecord>) {
         view.closed_places.take();
         view.stops_changed = true;
@@ -84,7 +84,7 @@ impl Indexed<StopRecord> for View {
     }
 }
 
-impl Indexed<Drain> for View {
+impl Indexed<Drain> for FleetProjection {
     fn changed(view: &mut Self, id: &str, old: Option<&Drain>) {
         match (view.drains.get(id).map(|d| d.row.robot_id.clone()), old) {
             (Some(robot_id), _) => {
@@ -100,7 +100,7 @@ impl Indexed<Drain> for View {
     }
 }
 
-impl Indexed<Attempt> for View {
+impl Indexed<Attempt> for FleetProjection {
     fn changed(view: &mut Self, id: &str, _old: Option<&Attempt>) {
         if let Some(attempt) = view.attempts.get(id) {
             view.dirty.insert(attempt.row.robot_id.clone());
@@ -108,20 +108,20 @@ impl Indexed<Attempt> for View {
     }
 }
 
-impl Indexed<HoldToken> for View {
+impl Indexed<HoldToken> for FleetProjection {
     fn changed(view: &mut Self, id: &str, old: Option<&HoldToken>) {
         let robot = view.holds.get(id).map(|h| h.row.robot_id.clone()).or_else(|| old.map(|h| h.robot_id.clone()));
         view.dirty.extend(robot);
     }
 }
 
-impl Indexed<RobotAuthority> for View {
+impl Indexed<RobotAuthority> for FleetProjection {
     fn changed(view: &mut Self, id: &str, _old: Option<&RobotAuthority>) {
         view.dirty.extend(view.authority.get(id).map(|a| a.row.robot_id.clone()));
     }
 }
 
-impl Indexed<RobotControl> for View {
+impl Indexed<RobotControl> for FleetProjection {
     /// A person's word about its load goes to the robot, whichever process took it.
     fn changed(view: &mut Self, id: &str, old: Option<&RobotControl>) {
         let word = |control: &RobotControl| control.load_settled.clone();
@@ -132,13 +132,13 @@ impl Indexed<RobotControl> for View {
     }
 }
 
-impl Indexed<Session> for View {
+impl Indexed<Session> for FleetProjection {
     fn changed(view: &mut Self, id: &str, _old: Option<&Session>) {
         view.dirty.extend(view.sessions.get(id).map(|s| s.row.robot_id.clone()));
     }
 }
 
-impl Indexed<Place> for View {
+impl Indexed<Place> for FleetProjection {
     fn changed(view: &mut Self, id: &str, old: Option<&Place>) {
         view.closed_places.take();
         for robot in old.into_iter().flat_map(|p| &p.holders).map(|h| &h.robot_id) {
@@ -157,7 +157,7 @@ impl Indexed<Place> for View {
 }
 
 /// Puts a task where its rows say that it stands: out of the queue, if it waits for no robot.
-pub(in crate::fleet) fn put_in_queue(view: &mut View, task_id: &TaskId) {
+pub(in crate::fleet) fn put_in_queue(view: &mut FleetProjection, task_id: &TaskId) {
     let rows = view.task(task_id).filter(|task| task.phase == Phase::Queued).zip(view.intake(task_id));
     let wait = rows.map(|(task, intake)| {
         let wait = match Wait::of(task, intake, &view.ended, view.queue.now) {
@@ -170,7 +170,7 @@ pub(in crate::fleet) fn put_in_queue(view: &mut View, task_id: &TaskId) {
 }
 
 /// A task has ended: those that depend on it, if there are any, wait for the next thing, or for nothing more.
-pub(in crate::fleet) fn note_end(view: &mut View, task_id: &TaskId, phase: Phase) {
+pub(in crate::fleet) fn note_end(view: &mut FleetProjection, task_id: &TaskId, phase: Phase) {
     if !view.dependants.contains_key(task_id) {
         return;
     }
@@ -181,7 +181,7 @@ pub(in crate::fleet) fn note_end(view: &mut View, task_id: &TaskId, phase: Phase
 }
 
 /// A task that was taken for ended goes on: those that depend on it wait for it again.
-pub(in crate::fleet) fn note_open(view: &mut View, task_id: &TaskId) {
+pub(in crate::fleet) fn note_open(view: &mut FleetProjection, task_id: &TaskId) {
     if view.ended.remove(task_id).is_none() {
         return;
     }
@@ -194,7 +194,7 @@ pub(in crate::fleet) fn note_open(view: &mut View, task_id: &TaskId) {
 }
 
 /// Time has passed: whose time has come is ready, and who waited for long is promoted.
-pub(in crate::fleet) fn advance(view: &mut View, now: Utc) {
+pub(in crate::fleet) fn advance(view: &mut FleetProjection, now: Utc) {
     view.queue.now = now;
     let due = [&view.queue.due, &view.queue.checks]
         .into_iter()
@@ -204,7 +204,7 @@ pub(in crate::fleet) fn advance(view: &mut View, now: Utc) {
     }
 }
 
-impl View {
+impl FleetProjection {
     /// A task is over, or gone: nothing is asked any more of those that it waited for alone.
     pub(super) fn waits_no_more(&mut self, intake: &TaskIntake) {
         for task_id in &intake.spec.depends_on {

@@ -1,6 +1,6 @@
 //! Whether a robot is heard, and whether what it says may be compared with the rows. Reads only; called by every room that acts on a heartbeat.
 
-use super::state::View;
+use super::state::FleetProjection;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::robot::{Lane, Presence};
@@ -19,7 +19,7 @@ pub fn presence(board: &Board, robot_id: &RobotId, now: &Now) -> Presence {
 }
 
 /// Whether the robot may still have authority to go on.
-pub fn lease_stands(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -> bool {
+pub fn lease_stands(view: &FleetProjection, board: &Board, robot_id: &RobotId, now: &Now) -> bool {
     if view.bugs.silence_frees_task() {
         return presence(board, robot_id, now) == Presence::Online;
     }
@@ -28,7 +28,7 @@ pub fn lease_stands(view: &View, board: &Board, robot_id: &RobotId, now: &Now) -
 }
 
 /// The robot's differences count: it has applied everything and everything it said has been consumed.
-pub fn is_settled(view: &View, live: &Live) -> bool {
+pub fn is_settled(view: &FleetProjection, live: &Live) -> bool {
     let id = live.robot_id.as_str();
     let Some(session) = view.sessions.get(id) else { return false };
     let current = session.row.session_epoch == live.report.session_epoch;
@@ -38,7 +38,7 @@ pub fn is_settled(view: &View, live: &Live) -> bool {
 }
 
 /// The heartbeat is not older than the robot's events that were consumed: an older one lists what has ended since.
-pub fn is_fresh(view: &View, live: &Live) -> bool {
+pub fn is_fresh(view: &FleetProjection, live: &Live) -> bool {
     let id = live.robot_id.as_str();
     let Some(session) = view.sessions.get(id) else { return false };
     let mark = view.lane_marks.get(&format!("{id}/{}", session.row.ring)).map_or(0, |m| m.row.event);

@@ -6,22 +6,22 @@
 
 use super::index;
 use super::rows::{RobotAuthority, RobotHolder};
-use super::state::View;
+use super::state::FleetProjection;
 use crate::ids::TaskId;
 use crate::limits;
 use crate::rows::{BadRow, Key, Part, Revision, Row, Seq, Table};
 use crate::task::{AttemptPhase, Phase, TaskIntake, TaskState};
 
-/// What the picture begins with: all that is alive. [`named`] says what is read with it.
+/// What the projection begins with: all that is alive. [`named`] says what is read with it.
 pub fn alive() -> Vec<Part> {
     let tasks = Phase::ALL.into_iter().filter(|p| !p.is_terminal()).map(Phase::number);
     let attempts = AttemptPhase::ALL.into_iter().filter(|p| !p.is_terminal()).map(AttemptPhase::number);
     let in_states =
         [Part::InStates(Table::TaskState, tasks.collect()), Part::InStates(Table::Attempt, attempts.collect())];
-    View::WHOLE.iter().map(|table| Part::Whole(*table)).chain(in_states).collect()
+    FleetProjection::WHOLE.iter().map(|table| Part::Whole(*table)).chain(in_states).collect()
 }
 
-/// What rows of the picture name: of a task that has not ended what was asked for, its newest attempt, and the tasks
+/// What rows of the projection name: of a task that has not ended what was asked for, its newest attempt, and the tasks
 /// that it waits for; of a robot the attempt that holds it.
 pub fn named(rows: &[Row]) -> Vec<Key> {
     let mut keys = Vec::new();
@@ -50,7 +50,7 @@ pub fn named(rows: &[Row]) -> Vec<Key> {
     keys
 }
 
-impl View {
+impl FleetProjection {
     /// Takes what was read at `seq` by [`alive`] and [`named`].
     ///
     /// # Errors
@@ -105,7 +105,7 @@ impl View {
         Ok(())
     }
 
-    /// Takes one row as the store has it; none: deleted. What this picture already has, or has let go on purpose, is
+    /// Takes one row as the store has it; none: deleted. What this projection already has, or has let go on purpose, is
     /// passed over.
     ///
     /// # Errors
@@ -120,7 +120,7 @@ impl View {
         self.take_row(key, revision, row)
     }
 
-    /// Puts a row as the store has it over what this picture had made of it. None: there is no such row.
+    /// Puts a row as the store has it over what this projection had made of it. None: there is no such row.
     ///
     /// # Errors
     /// A row that cannot be read.
@@ -133,7 +133,7 @@ impl View {
         row.map_or(Ok(()), |row| self.absorb(key, row.revision, Some(row)))
     }
 
-    /// A row that this picture has let go on purpose, or asks for by id alone.
+    /// A row that this projection has let go on purpose, or asks for by id alone.
     fn is_past(&self, key: &Key) -> bool {
         match key.table {
             Table::TaskIntake | Table::TaskState => {
@@ -175,7 +175,7 @@ impl View {
         });
     }
 
-    /// Forgets what a planner would have to look at: whoever plans next begins with a picture of its own.
+    /// Forgets what a planner would have to look at: whoever plans next begins with a projection of its own.
     pub fn rest(&mut self) {
         self.forget_ended();
         self.dirty.clear();

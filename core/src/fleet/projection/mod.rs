@@ -15,6 +15,6 @@ pub mod refused;
 pub mod rows;
 pub mod state;
 
-pub use crate::picture::{Rowed, Slot};
+pub use crate::projection::{Rowed, Slot};
 pub use loading::{alive, named};
-pub use state::View;
+pub use state::FleetProjection;

@@ -5,24 +5,24 @@
 use super::command::Command;
 use super::liveness::Board;
 use super::rows::Incident;
-use super::state::View;
+use super::state::FleetProjection;
 use crate::identity::{Caller, Permission};
 use crate::ids::{AreaId, PlaceId, RobotId, TaskId};
 use crate::reason::{Code, Kind, Reason, Refusal};
 use std::collections::BTreeSet;
 
 /// The area in which a robot is; none: not known.
-pub fn area_of(view: &View, board: &Board, robot_id: &RobotId) -> Option<AreaId> {
+pub fn area_of(view: &FleetProjection, board: &Board, robot_id: &RobotId) -> Option<AreaId> {
     board.get(robot_id)?.area(&view.site).cloned()
 }
 
 /// The areas of the goals of a task that has not ended.
-pub fn areas_of_task(view: &View, task_id: &TaskId) -> BTreeSet<AreaId> {
+pub fn areas_of_task(view: &FleetProjection, task_id: &TaskId) -> BTreeSet<AreaId> {
     view.intake(task_id).map(|intake| view.site.areas_of_task(&intake.spec)).unwrap_or_default()
 }
 
 /// The areas of what an incident is about: of the robot, of the task, the area, or the place. None: the site.
-pub fn areas_of_incident(view: &View, board: &Board, incident: &Incident) -> BTreeSet<AreaId> {
+pub fn areas_of_incident(view: &FleetProjection, board: &Board, incident: &Incident) -> BTreeSet<AreaId> {
     if let Some(robot_id) = &incident.robot_id {
         return area_of(view, board, robot_id).into_iter().collect();
     }
@@ -37,23 +37,23 @@ pub fn areas_of_incident(view: &View, board: &Board, incident: &Incident) -> BTr
 }
 
 /// Whether a caller may see a robot.
-pub fn sees_robot(view: &View, board: &Board, by: &Caller, robot_id: &RobotId) -> bool {
+pub fn sees_robot(view: &FleetProjection, board: &Board, by: &Caller, robot_id: &RobotId) -> bool {
     by.may_everywhere(Permission::Read) || by.may_over(Permission::Read, area_of(view, board, robot_id).as_ref())
 }
 
 /// Whether a caller may see an incident.
-pub fn sees_incident(view: &View, board: &Board, by: &Caller, incident: &Incident) -> bool {
+pub fn sees_incident(view: &FleetProjection, board: &Board, by: &Caller, incident: &Incident) -> bool {
     let read = Permission::Read;
     by.may_everywhere(read) || by.may_over(read, &areas_of_incident(view, board, incident))
 }
 
 /// Whether a caller may see a place.
-pub fn sees_place(view: &View, by: &Caller, place_id: &PlaceId) -> bool {
+pub fn sees_place(view: &FleetProjection, by: &Caller, place_id: &PlaceId) -> bool {
     by.may_everywhere(Permission::Read) || by.may_over(Permission::Read, &view.site.areas_of_place(place_id))
 }
 
 /// Whether a caller may see a task.
-pub fn sees_task(view: &View, by: &Caller, task_id: &TaskId) -> bool {
+pub fn sees_task(view: &FleetProjection, by: &Caller, task_id: &TaskId) -> bool {
     by.may_everywhere(Permission::Read) || by.may_over(Permission::Read, &areas_of_task(view, task_id))
 }
 
@@ -61,7 +61,7 @@ pub fn sees_task(view: &View, by: &Caller, task_id: &TaskId) -> bool {
 ///
 /// # Errors
 /// It may not see what it is about, or may not do that to it.
-pub fn permit(view: &View, board: &Board, by: &Caller, command: &Command) -> Result<(), Refusal> {
+pub fn permit(view: &FleetProjection, board: &Board, by: &Caller, command: &Command) -> Result<(), Refusal> {
     let operate = Permission::Operate;
     if by.may_everywhere(operate) && by.may_everywhere(Permission::Read) {
         return Ok(());

@@ -4,7 +4,7 @@
 
 use crate::ids::{PlaceId, RobotId};
 use crate::limits;
-use crate::picture::Outline;
+use crate::projection::Outline;
 use crate::reason::{Code, Reason};
 use crate::rows::{Key, Table};
 use std::collections::{BTreeMap, BTreeSet};

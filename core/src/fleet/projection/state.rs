@@ -13,8 +13,8 @@ use crate::fleet::bugs::Bugs;
 use crate::identity::RobotIdentity;
 use crate::ids::{AttemptId, RobotId, TaskId};
 use crate::maintenance::{DrainRelease, DrainRequest};
-use crate::picture::{Indexed, picture};
 use crate::policy::AreaPolicy;
+use crate::projection::{Indexed, projection};
 use crate::reason::Reason;
 use crate::rows::Seq;
 use crate::site::Site;
@@ -27,9 +27,9 @@ use crate::work::{DesiredPolicy, DesiredWork, LaneMark, Session};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, OnceLock};
 
-picture! {
+projection! {
     /// What fleet knows.
-    pub struct View of Fleet;
+    pub struct FleetProjection of Fleet;
     new(site: Arc<Site>, started: Now, read: Now);
     whole {
         /// Deadlines that are rows.
@@ -125,7 +125,7 @@ picture! {
         ended: BTreeMap<TaskId, Phase> = BTreeMap::new();
         /// How many tasks that have not ended wait for a task.
         dependants: BTreeMap<TaskId, u32> = BTreeMap::new();
-        /// Tasks that another one waits for, and that this picture knows nothing of: whoever keeps it asks the store.
+        /// Tasks that another one waits for, and that this projection knows nothing of: whoever keeps it asks the store.
         unasked: BTreeSet<TaskId> = BTreeSet::new();
         /// Ended tasks that were let go, and how far the feed had been taken then: it says of them once more what is
         /// known.
@@ -144,7 +144,7 @@ picture! {
         policy_dirty: BTreeSet<RobotId> = BTreeSet::new();
         /// Last entry of the feed that was taken.
         absorbed: Seq = Seq(0);
-        /// Rows were read at this entry: what older entries say of rows is in the picture already, also that a row is
+        /// Rows were read at this entry: what older entries say of rows is in the projection already, also that a row is
         /// gone.
         read_at: Seq = Seq(0);
         /// Reading of the clocks when fleet started: every lease counts as renewed then, and no timer fires soon after.
@@ -172,7 +172,7 @@ picture! {
     }
 }
 
-impl View {
+impl FleetProjection {
     /// Serving time at `now`.
     pub fn serving(&self, now: &Now) -> ServiceClock {
         ServiceClock {
@@ -234,7 +234,7 @@ impl View {
 }
 
 /// Places that a robot holds, with its entry in each.
-pub fn held<'a>(view: &'a View, robot_id: &RobotId) -> impl Iterator<Item = (&'a Place, &'a PlaceHolder)> {
+pub fn held<'a>(view: &'a FleetProjection, robot_id: &RobotId) -> impl Iterator<Item = (&'a Place, &'a PlaceHolder)> {
     let robot_id = robot_id.clone();
     let ids = view.held_places.get(&robot_id).into_iter().flatten();
     ids.filter_map(move |id| {

@@ -16,7 +16,7 @@
 use super::{claims, plausible};
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::rows::HolderState;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{AttemptId, PlaceId, RobotId};
 use crate::site::Site;
 use crate::task::{Attempt, AttemptPhase};
@@ -87,7 +87,7 @@ fn lose(tx: &mut Tx, id: &AttemptId) {
 }
 
 /// The map has changed: where robots were by the one before tells nothing of this one.
-pub(in crate::fleet) fn forget(view: &mut View, now: Now, plan: &mut Plan) {
+pub(in crate::fleet) fn forget(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     let noted = view.attempts.values().map(|a| &a.row).filter(|a| a.been.is_some() && may_end(a));
     let noted: Vec<AttemptId> = noted.map(|a| a.attempt.clone()).collect();
     for id in &noted {
@@ -102,7 +102,7 @@ fn may_end(a: &Attempt) -> bool {
 
 /// A place where the robot had to be for what it reports, and where it was not seen. None: its work is not over, it was at each of them, or
 /// that cannot be told.
-pub fn unseen(view: &View, now: &Now, robot_id: &RobotId, report: &AttemptReport) -> Option<PlaceId> {
+pub fn unseen(view: &FleetProjection, now: &Now, robot_id: &RobotId, report: &AttemptReport) -> Option<PlaceId> {
     let id = &report.attempt;
     let task_id = id.subject.task_id().filter(|_| report.state.is_over())?;
     let a = view.attempt(id).filter(|a| a.robot_id == *robot_id && may_end(a))?;
@@ -119,14 +119,20 @@ pub fn unseen(view: &View, now: &Now, robot_id: &RobotId, report: &AttemptReport
 
 /// How far the attempt is for its task, if its robot says that so many steps are done: a step that must not be done twice counts as done,
 /// wherever its robot was, and so does what came before it.
-pub(in crate::fleet) fn proven(view: &View, now: &Now, a: &Attempt, steps: &[WorkStep], claimed: u32) -> u32 {
+pub(in crate::fleet) fn proven(
+    view: &FleetProjection,
+    now: &Now,
+    a: &Attempt,
+    steps: &[WorkStep],
+    claimed: u32,
+) -> u32 {
     let Some((unseen, _)) = unproven(view, now, a, claimed, false) else { return claimed };
     let irreversible = steps.iter().take(claimed as usize).rposition(|step| step.effect == Effect::AtMostOnce);
     unseen.max(irreversible.map_or(0, |step| step as u32 + 1))
 }
 
 /// The first drive of the attempt among the first `claimed` steps that ends where its robot was not seen.
-fn unproven(view: &View, now: &Now, a: &Attempt, claimed: u32, is_success: bool) -> Option<(u32, PlaceId)> {
+fn unproven(view: &FleetProjection, now: &Now, a: &Attempt, claimed: u32, is_success: bool) -> Option<(u32, PlaceId)> {
     let been = a.been.as_ref().filter(|_| !view.bugs.success_is_believed())?;
     let steps = &view.intake(a.attempt.subject.task_id()?)?.spec.steps;
     let begun = (is_success || claimed > been.resume_step).then(|| from_step(steps, been.resume_step));
@@ -153,7 +159,7 @@ fn unproven(view: &View, now: &Now, a: &Attempt, claimed: u32, is_success: bool)
 }
 
 /// The row of the place says that the robot is not inside of it now. One that this build cannot read says nothing.
-fn is_elsewhere(view: &View, robot_id: &RobotId, place_id: &PlaceId) -> bool {
+fn is_elsewhere(view: &FleetProjection, robot_id: &RobotId, place_id: &PlaceId) -> bool {
     let place = view.places.get(place_id.as_str()).map(|place| &place.row);
     place.is_some_and(|place| place.holder(robot_id).is_none_or(|holder| holder.state != HolderState::Inside))
 }

@@ -2,7 +2,7 @@
 
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::{RobotAuthority, RobotHolder};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{AttemptId, RobotId};
 use crate::task::state::{Been, Errand};
 use crate::task::{Attempt, AttemptPhase};
@@ -16,7 +16,7 @@ pub const ERRAND_TIMEOUT: SiteDuration = SiteDuration::from_secs(4 * 3600);
 pub const AT_GOAL: u32 = 1;
 
 /// Steps of an errand: drive to its goal, then charge or park.
-pub fn steps(view: &View, a: &Attempt) -> Vec<WorkStep> {
+pub fn steps(view: &FleetProjection, a: &Attempt) -> Vec<WorkStep> {
     let Some(goal) = &a.goal else { return Vec::new() };
     let mut params = serde_json::Map::new();
     let name = match a.errand {

@@ -14,7 +14,7 @@ use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::{HolderState, Incident, Place, PlaceHolder};
-use crate::fleet::projection::state::{self, View};
+use crate::fleet::projection::state::{self, FleetProjection};
 use crate::ids::{PlaceId, RobotId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -30,7 +30,7 @@ pub(in crate::fleet) const PLACES: &str = "places";
 pub(in crate::fleet) type Difference = (PlaceId, u64, PlaceNews);
 
 /// What a settled robot says of places that the rows do not; what is near its pose comes before what is not.
-pub(in crate::fleet) fn differences(view: &View, live: &Live) -> Vec<Difference> {
+pub(in crate::fleet) fn differences(view: &FleetProjection, live: &Live) -> Vec<Difference> {
     let robot_id = &live.robot_id;
     let standing_on = live.report.vitals.waypoint.as_ref().filter(|_| live.report.vitals.speed_mm_s == 0);
     let mut changes = Vec::new();
@@ -66,23 +66,23 @@ pub(in crate::fleet) fn differences(view: &View, live: &Live) -> Vec<Difference>
 }
 
 /// Whether the robot's pose lies in the place or near it.
-fn is_near(view: &View, live: &Live, place_id: &PlaceId) -> bool {
+fn is_near(view: &FleetProjection, live: &Live, place_id: &PlaceId) -> bool {
     is_within(view, live, place_id, limits::CLAIMED_PLACE_MARGIN_MM)
 }
 
 /// Whether the robot's pose lies in the place.
-fn lies_inside(view: &View, live: &Live, place_id: &PlaceId) -> bool {
+fn lies_inside(view: &FleetProjection, live: &Live, place_id: &PlaceId) -> bool {
     is_within(view, live, place_id, 0)
 }
 
-fn is_within(view: &View, live: &Live, place_id: &PlaceId, margin_mm: i32) -> bool {
+fn is_within(view: &FleetProjection, live: &Live, place_id: &PlaceId, margin_mm: i32) -> bool {
     let Some(pose) = &live.report.vitals.pose else { return false };
     Region::of_zone(&view.site, place_id).is_some_and(|region| region.is_near(pose, margin_mm))
 }
 
 /// The robot's event says that it entered a place which it does not hold, and by the pose of this session it does not stand near: what its
 /// next heartbeat says comes first.
-pub fn waits_for_heartbeat(view: &View, board: &Board, robot_id: &RobotId, place_id: &PlaceId) -> bool {
+pub fn waits_for_heartbeat(view: &FleetProjection, board: &Board, robot_id: &RobotId, place_id: &PlaceId) -> bool {
     let is_held = view.places.get(place_id.as_str()).is_some_and(|place| place.row.holder(robot_id).is_some());
     let session = view.sessions.get(robot_id.as_str()).map(|s| s.row.session_epoch);
     let live = board.get(robot_id).filter(|live| Some(live.report.session_epoch) == session);
@@ -91,12 +91,12 @@ pub fn waits_for_heartbeat(view: &View, board: &Board, robot_id: &RobotId, place
 }
 
 /// Places without a grant of ours that the robot holds already.
-fn taken_over(view: &View, robot_id: &RobotId) -> usize {
+fn taken_over(view: &FleetProjection, robot_id: &RobotId) -> usize {
     state::held(view, robot_id).filter(|(_, holder)| holder.claimed).count()
 }
 
 /// The robot says that it is inside of more places without a grant than it can be, and no person has looked at that.
-pub fn too_many(view: &View, live: &Live) -> Option<Reason> {
+pub fn too_many(view: &FleetProjection, live: &Live) -> Option<Reason> {
     excess(view, live).map(|_| implausible())
 }
 
@@ -105,7 +105,7 @@ pub(in crate::fleet) fn implausible() -> Reason {
 }
 
 /// Places without a grant that the robot says it is inside of, if they are more than it can be inside of and no person has looked at that.
-pub(in crate::fleet) fn excess<'l>(view: &View, live: &'l Live) -> Option<BTreeSet<&'l str>> {
+pub(in crate::fleet) fn excess<'l>(view: &FleetProjection, live: &'l Live) -> Option<BTreeSet<&'l str>> {
     let robot_id = &live.robot_id;
     let is_claim = |id: &PlaceId| {
         let place = view.places.get(id.as_str()).map(|place| &place.row);
@@ -117,7 +117,7 @@ pub(in crate::fleet) fn excess<'l>(view: &View, live: &'l Live) -> Option<BTreeS
 }
 
 /// A person closed an incident that names all of these places.
-fn is_looked_at(view: &View, robot_id: &RobotId, claims: &BTreeSet<&str>) -> bool {
+fn is_looked_at(view: &FleetProjection, robot_id: &RobotId, claims: &BTreeSet<&str>) -> bool {
     let is_closed = |i: &&Incident| {
         i.closed.is_some() && i.reason.code == Code::PlacesImplausible && i.robot_id.as_ref() == Some(robot_id)
     };
@@ -153,7 +153,7 @@ pub fn outran(tx: &mut Tx, robot_id: &RobotId, applied_work: u64, is_followed: b
 
 /// The store turned out a moment ago to be older than this robot: it does not know what it gave it. What one robot says excuses no other:
 /// whatever a store gave and forgot has raised the generation of the robot that has it.
-pub fn is_ahead(view: &View, robot_id: &RobotId, now: &Now) -> bool {
+pub fn is_ahead(view: &FleetProjection, robot_id: &RobotId, now: &Now) -> bool {
     let is_it = |i: &Incident| i.reason.code == Code::StoreBehindRobot && i.robot_id.as_ref() == Some(robot_id);
     let told = view.incidents.values().map(|i| &i.row).filter(|i| is_it(i));
     let given = view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation);
@@ -193,7 +193,7 @@ fn crowd(place: &Place) -> Vec<&RobotId> {
 }
 
 /// Another robot is where there is room for this one only.
-pub fn broken(view: &View, robot_id: &RobotId) -> Option<Reason> {
+pub fn broken(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> {
     state::held(view, robot_id).find_map(|(place, _)| {
         let crowd = crowd(place);
         let other = crowd.iter().find(|other| **other != robot_id).filter(|_| crowd.contains(&robot_id))?;

@@ -5,7 +5,7 @@
 use super::load;
 use crate::fleet::decision::slice::Slice;
 use crate::fleet::projection::rows::RobotControl;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, FaultClass, HardwareStop, Mode, StopLevel};
@@ -14,7 +14,11 @@ use crate::task::{TaskIntake, TaskState};
 use crate::work::{Live, Session};
 use std::collections::BTreeMap;
 
-pub(in crate::fleet) fn decided_by_people(view: &View, robot_id: &RobotId, live: Option<&Live>) -> Result<(), Reason> {
+pub(in crate::fleet) fn decided_by_people(
+    view: &FleetProjection,
+    robot_id: &RobotId,
+    live: Option<&Live>,
+) -> Result<(), Reason> {
     if let Some(control) = view.control.get(robot_id.as_str()).map(|c| &c.row) {
         match control.duty() {
             Duty::InWork => {}
@@ -59,7 +63,7 @@ pub(in crate::fleet) fn reported(live: &Live) -> Result<(), Reason> {
 
 /// What does not pass by itself: pin, binding, what the robot refused or failed for good, and what it said of itself at its last Hello.
 pub(in crate::fleet) fn fits(
-    view: &View,
+    view: &FleetProjection,
     session: &Session,
     task: &TaskState,
     intake: &TaskIntake,
@@ -70,7 +74,12 @@ pub(in crate::fleet) fn fits(
 
 /// Whether another robot than this one could do the task, apart from its other work: it is heard, nothing that people
 /// decided keeps it from work, and it has not failed the task.
-pub(in crate::fleet) fn another_could(view: &View, task: &TaskState, intake: &TaskIntake, robot_id: &RobotId) -> bool {
+pub(in crate::fleet) fn another_could(
+    view: &FleetProjection,
+    task: &TaskState,
+    intake: &TaskIntake,
+    robot_id: &RobotId,
+) -> bool {
     let is_at_work = |id: &RobotId| {
         let is_heard = view.attached.get(id).is_some_and(|attached| attached.is_heard);
         is_heard && decided_by_people(view, id, None).is_ok()
@@ -104,7 +113,7 @@ fn bound(robot_id: &RobotId, task: &TaskState, intake: &TaskIntake) -> Result<()
 /// # Errors
 /// Why not, with how many robots each reason leaves out.
 pub(in crate::fleet) fn could_ever(
-    view: &View,
+    view: &FleetProjection,
     task: &TaskState,
     intake: &TaskIntake,
     slice: &mut Slice,
@@ -133,7 +142,7 @@ pub(in crate::fleet) fn could_ever(
     Err(against.into_iter().fold(reason, |reason, (code, robots)| reason.with(code.as_str(), robots)))
 }
 
-fn able(view: &View, session: &Session, intake: &TaskIntake) -> Result<(), Reason> {
+fn able(view: &FleetProjection, session: &Session, intake: &TaskIntake) -> Result<(), Reason> {
     let spec = &intake.spec;
     let has = |c: &str| session.inventory.capabilities.iter().any(|h| h == c);
     let wanted = spec.actions().into_iter().chain(spec.selector.capabilities.iter().map(String::as_str));

@@ -6,7 +6,7 @@ use super::attempts;
 use super::transitions::{disarm, end_attempt};
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::{Timer, TimerKind};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::reason::Reason;
@@ -15,7 +15,7 @@ use crate::task::{Attempt, AttemptPhase};
 use crate::work::{AttemptReport, WorkState};
 
 /// Errands that are on their way to a stop.
-pub fn stopping(view: &View) -> usize {
+pub fn stopping(view: &FleetProjection) -> usize {
     view.attempts.values().filter(|a| a.row.errand.is_some() && a.row.phase == AttemptPhase::Stopping).count()
 }
 

@@ -11,7 +11,7 @@ use crate::fleet::decision::plan::Tx;
 use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{Drain, DrainState, LoadSettled, RobotControl};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::RobotId;
 use crate::reason::{Code, Kind, Reason, Refusal};
 use crate::robot::{Load, Presence};
@@ -20,30 +20,34 @@ use crate::time::Now;
 use crate::work::{Effect, Live, LoadWord};
 
 /// What a robot carries by its newest heartbeat, unless a person has said since, while it was not heard, that it carries nothing.
-pub fn carried<'l>(view: &View, live: &'l Live) -> Option<&'l Load> {
+pub fn carried<'l>(view: &FleetProjection, live: &'l Live) -> Option<&'l Load> {
     live.report.load.as_ref().filter(|_| settled(view, &live.robot_id, Some(live)).is_none())
 }
 
 /// A person's word that holds: the robot was not heard then, and has said nothing newer.
-fn settled<'v>(view: &'v View, robot_id: &RobotId, live: Option<&Live>) -> Option<&'v LoadSettled> {
+fn settled<'v>(view: &'v FleetProjection, robot_id: &RobotId, live: Option<&Live>) -> Option<&'v LoadSettled> {
     let word = view.control.get(robot_id.as_str())?.row.load_settled.as_ref().filter(|word| !word.is_told)?;
     let is_newer = |live: &Live| (live.report.session_epoch, live.report.hb) > (word.session_epoch, word.hb);
     (!live.is_some_and(is_newer)).then_some(word)
 }
 
 /// A person's word that the robot carries nothing: it holds, or the robot is told it.
-pub fn standing_word<'v>(view: &'v View, robot_id: &RobotId, live: Option<&Live>) -> Option<&'v LoadSettled> {
+pub fn standing_word<'v>(
+    view: &'v FleetProjection,
+    robot_id: &RobotId,
+    live: Option<&Live>,
+) -> Option<&'v LoadSettled> {
     let told = || view.control.get(robot_id.as_str())?.row.load_settled.as_ref().filter(|word| word.is_told);
     settled(view, robot_id, live).or_else(told)
 }
 
 /// Whether the robot knows what it carries by its memory alone, and forgets it by a person's word.
-fn is_by_memory(view: &View, robot_id: &RobotId) -> bool {
+fn is_by_memory(view: &FleetProjection, robot_id: &RobotId) -> bool {
     view.sessions.get(robot_id.as_str()).is_some_and(|session| session.row.inventory.load_by_memory)
 }
 
 /// A person's word as the robot is told it: while it says by memory, in the session of that word, that it carries something.
-pub(in crate::fleet) fn word_for(view: &View, live: &Live) -> Option<LoadWord> {
+pub(in crate::fleet) fn word_for(view: &FleetProjection, live: &Live) -> Option<LoadWord> {
     let report = &live.report;
     let word = view.control.get(live.robot_id.as_str())?.row.load_settled.as_ref()?;
     let is_older = word.session_epoch == report.session_epoch && word.hb <= report.hb;
@@ -72,7 +76,7 @@ pub(in crate::fleet) fn is_item_of(load: &Load, task: &TaskState, intake: &TaskI
 }
 
 /// Says that the robot carries what keeps it from other work, and what a person can do about it.
-pub(in crate::fleet) fn explain_load(view: &View, robot_id: &RobotId, load: &Load) -> Reason {
+pub(in crate::fleet) fn explain_load(view: &FleetProjection, robot_id: &RobotId, load: &Load) -> Reason {
     let reason = Reason::from(Code::RobotLoaded).with("item", &load.item);
     if !is_by_memory(view, robot_id) {
         return reason;
@@ -85,7 +89,12 @@ pub(in crate::fleet) fn explain_load(view: &View, robot_id: &RobotId, load: &Loa
 ///
 /// # Errors
 /// Who says otherwise.
-pub(in crate::fleet) fn may_settle(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Result<(), Refusal> {
+pub(in crate::fleet) fn may_settle(
+    view: &FleetProjection,
+    board: &Board,
+    now: &Now,
+    robot_id: &RobotId,
+) -> Result<(), Refusal> {
     let no = |reason: Reason| Err(Refusal::new(Kind::Precondition, reason.with("robot_id", robot_id)));
     let is_believed = liveness::presence(board, robot_id, now) != Presence::Offline && !is_by_memory(view, robot_id);
     if let Some(load) = board.get(robot_id).filter(|_| is_believed).and_then(|live| live.report.load.as_ref()) {
@@ -127,13 +136,13 @@ pub(in crate::fleet) fn settle(tx: &Tx, board: &Board, robot_id: &RobotId, reaso
 
 /// The robot carries something that it is not taken with: software changes only on an empty robot, unless it goes back to what it kept.
 /// With a person's drain somebody comes to it, who waits only for a task that goes on.
-pub fn must_deliver(view: &View, drain: &Drain, live: Option<&Live>) -> bool {
+pub fn must_deliver(view: &FleetProjection, drain: &Drain, live: Option<&Live>) -> bool {
     let loaded = live.is_some_and(|live| carried(view, live).is_some());
     loaded && !drain.returns && (!drain.is_of_person() || goes_on(view, live))
 }
 
 /// The task whose item the robot carries is tried again by itself, on this robot.
-pub fn goes_on(view: &View, live: Option<&Live>) -> bool {
+pub fn goes_on(view: &FleetProjection, live: Option<&Live>) -> bool {
     let Some(live) = live else { return false };
     let task_id = carried(view, live).and_then(|load| load.task_id.as_ref());
     task_id.and_then(|id| view.task(id)).is_some_and(|task| {
@@ -143,6 +152,6 @@ pub fn goes_on(view: &View, live: Option<&Live>) -> bool {
 }
 
 /// Whether a robot that drains may be given work all the same: of the task whose item it carries, and of no other.
-pub fn may_end_its_task(view: &View, drain: &Drain, live: &Live) -> bool {
+pub fn may_end_its_task(view: &FleetProjection, drain: &Drain, live: &Live) -> bool {
     drain.state == DrainState::Draining && must_deliver(view, drain, Some(live)) && goes_on(view, Some(live))
 }

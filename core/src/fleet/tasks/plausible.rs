@@ -10,7 +10,7 @@
 
 use super::{attempts, claims};
 use crate::fleet::projection::liveness;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{AttemptId, RobotId};
 use crate::reason::{Code, Reason};
 use crate::task::{Attempt, AttemptPhase, TaskIntake};
@@ -29,7 +29,7 @@ struct Bounds {
 
 impl Bounds {
     /// Those of `a`; none if nothing is known of its steps any more.
-    fn of(view: &View, a: &Attempt) -> Option<Self> {
+    fn of(view: &FleetProjection, a: &Attempt) -> Option<Self> {
         let given = view.desired_work.get(a.robot_id.as_str()).and_then(|d| d.row.assignment.as_ref());
         if let Some(given) = given.filter(|given| given.attempt == a.attempt) {
             let steps = given.steps.len() as u32;
@@ -59,7 +59,13 @@ impl Bounds {
 }
 
 /// Why a report of the attempt cannot be; none: it is plausible, or the attempt is over.
-pub fn judge(view: &View, id: &AttemptId, robot_id: &RobotId, state: WorkState, step_index: u32) -> Option<Reason> {
+pub fn judge(
+    view: &FleetProjection,
+    id: &AttemptId,
+    robot_id: &RobotId,
+    state: WorkState,
+    step_index: u32,
+) -> Option<Reason> {
     let a = view.attempt(id).filter(|a| a.robot_id == *robot_id)?;
     if a.phase.is_terminal() && a.phase != AttemptPhase::Lost {
         return None;
@@ -81,7 +87,7 @@ pub fn judge(view: &View, id: &AttemptId, robot_id: &RobotId, state: WorkState, 
 }
 
 /// The first attempt that a heartbeat lists in a way that cannot be. One that is older than the robot's events tells nothing.
-pub fn doubtful(view: &View, live: &Live) -> Option<(AttemptId, Reason)> {
+pub fn doubtful(view: &FleetProjection, live: &Live) -> Option<(AttemptId, Reason)> {
     if !liveness::is_fresh(view, live) {
         return None;
     }
@@ -97,7 +103,7 @@ pub fn doubtful(view: &View, live: &Live) -> Option<(AttemptId, Reason)> {
 ///
 /// # Errors
 /// If so; the reason says what.
-pub fn keeps_back(view: &View, live: &Live) -> Result<(), Reason> {
+pub fn keeps_back(view: &FleetProjection, live: &Live) -> Result<(), Reason> {
     view.unknown_rows.screen(&live.robot_id)?;
     view.refused.screen(&live.robot_id)?;
     match doubtful(view, live).map(|(_, why)| why).or_else(|| claims::too_many(view, live)) {

@@ -8,7 +8,7 @@ use super::transitions::{News, arm, disarm, happen};
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{Timer, TimerKind};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{AttemptId, Subject, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -17,7 +17,7 @@ use crate::task::{Event, Phase, Then};
 use crate::time::Now;
 
 /// Timers that are due, and tasks whose deadline passed.
-pub fn due(view: &View, now: &Now) -> (Vec<Timer>, Vec<TaskId>) {
+pub fn due(view: &FleetProjection, now: &Now) -> (Vec<Timer>, Vec<TaskId>) {
     if now.link.since(view.started.link) < limits::TIMER_GRACE {
         return (Vec::new(), Vec::new());
     }
@@ -32,7 +32,7 @@ pub fn due(view: &View, now: &Now) -> (Vec<Timer>, Vec<TaskId>) {
 }
 
 /// Whether the deadline of a task has passed and has not had its effect. In NEEDS_OPERATOR a person decides.
-pub(in crate::fleet) fn is_late(view: &View, task_id: &TaskId, now: &Now) -> bool {
+pub(in crate::fleet) fn is_late(view: &FleetProjection, task_id: &TaskId, now: &Now) -> bool {
     let Some((task, intake)) = view.task(task_id).zip(view.intake(task_id)) else { return false };
     let ends = task.phase.is_terminal() || matches!(task.then, Some(Then::Expired | Then::Canceled));
     let passed = intake.spec.deadline.is_some_and(|deadline| deadline <= now.utc);

@@ -6,7 +6,7 @@
 use super::{arrivals, attempts, breaker, eligibility, load, plausible};
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::{HolderState, RobotAuthority, RobotCounter, RobotHolder, Timer, TimerKind};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -508,7 +508,7 @@ pub fn wants_cancel(task: &TaskState) -> bool {
 }
 
 /// Whether the task may wait for another robot from its next step boundary on: it runs, lets others go first, and is not opened.
-pub fn may_suspend(view: &View, task_id: &TaskId, live: &Live) -> bool {
+pub fn may_suspend(view: &FleetProjection, task_id: &TaskId, live: &Live) -> bool {
     let Some(task) = view.task(task_id).filter(|t| t.phase == Phase::Running && t.opened.is_none()) else {
         return false;
     };

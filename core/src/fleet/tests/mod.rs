@@ -1,4 +1,4 @@
-//! A picture with robots that stand idle and tasks that wait, for tests of one cycle.
+//! A projection with robots that stand idle and tasks that wait, for tests of one cycle.
 
 mod arrivals;
 mod backlog;
@@ -14,7 +14,7 @@ mod opened;
 mod order;
 mod unexplained;
 
-use super::projection::{Rowed, View};
+use super::projection::{FleetProjection, Rowed};
 use super::{Board, Pace, Plan, cycle};
 use crate::ids::{AttemptId, RobotId, TaskId, WaypointId};
 use crate::reason::Reason;
@@ -32,9 +32,9 @@ const BEGIN: Utc = Utc(1_780_000_000_000);
 /// Fleet has served for so long by then, milliseconds: its timers fire.
 const SERVED_MS: u64 = 60_000;
 
-/// Fleet's picture, what robots last said, and a clock.
+/// Fleet's projection, what robots last said, and a clock.
 struct Rig {
-    view: View,
+    view: FleetProjection,
     board: Board,
     now: Now,
     number: u64,
@@ -48,7 +48,7 @@ impl Rig {
     fn on(site_text: &str) -> Self {
         let site = Arc::new(text::parse(site_text).expect("a site"));
         let begun = Now { utc: Utc(BEGIN.0 - SERVED_MS as i64), wall: BEGIN, ..Now::default() };
-        let view = View::new(site, begun, begun);
+        let view = FleetProjection::new(site, begun, begun);
         let now = Now { site: SiteTime(SERVED_MS), link: LinkTime(SERVED_MS), utc: BEGIN, wall: BEGIN, jump: None };
         Self { view, board: Board::new(), now, number: 0 }
     }

@@ -11,7 +11,7 @@ use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Plan;
 use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::projection::rows::{Incident, Place, PlaceHolder};
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{PlaceId, RobotId, WaypointId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -37,7 +37,7 @@ pub struct Closure {
 }
 
 /// What is closed of the place; none: nothing.
-pub fn find_closure(view: &View, place: &Place) -> Option<Closure> {
+pub fn find_closure(view: &FleetProjection, place: &Place) -> Option<Closure> {
     let of_holder = |h: &PlaceHolder| lost(view, &h.robot_id).map(|a| (h.robot_id.to_string(), a.ended));
     let mut robots: BTreeMap<String, Option<Utc>> = place.holders.iter().filter_map(of_holder).collect();
     let quarantine = place.quarantine.as_ref();
@@ -77,7 +77,7 @@ fn describe_closure(place: &Place, named: &[&str], since: Option<Utc>, command: 
 }
 
 /// The attempt that a robot still has, and that was given up because nobody knew what the robot did.
-fn lost<'v>(view: &'v View, robot_id: &RobotId) -> Option<&'v Attempt> {
+fn lost<'v>(view: &'v FleetProjection, robot_id: &RobotId) -> Option<&'v Attempt> {
     view.attempt(view.held_by(robot_id)?).filter(|a| a.phase == AttemptPhase::Lost)
 }
 
@@ -103,7 +103,7 @@ impl Closure {
 }
 
 /// A way that a closed place bars, with that place; another reason stays as it is.
-pub fn name_closed(view: &View, reason: Reason) -> Reason {
+pub fn name_closed(view: &FleetProjection, reason: Reason) -> Reason {
     if reason.code != Code::PlaceBlocked || !reason.message.is_empty() {
         return reason;
     }
@@ -122,7 +122,7 @@ pub fn name_closed(view: &View, reason: Reason) -> Reason {
 }
 
 /// Opens an incident of each place that is closed, and closes those of places that are open.
-pub(in crate::fleet) fn tell_closed(view: &mut View, now: Now, plan: &mut Plan) {
+pub(in crate::fleet) fn tell_closed(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     let closed = view.places.values().filter_map(|place| find_closure(view, &place.row));
     let closed: BTreeMap<String, Closure> = closed.map(|closure| (closure.place_id.to_string(), closure)).collect();
     let told = view.incidents.values().map(|i| &i.row).filter(|i| i.reason.code == Code::PlaceQuarantined);

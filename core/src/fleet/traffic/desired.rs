@@ -10,7 +10,7 @@ use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::{HolderState, RobotHolder};
-use crate::fleet::projection::state::{View, held};
+use crate::fleet::projection::state::{FleetProjection, held};
 use crate::fleet::tasks::{attempts, claims, load};
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
@@ -94,14 +94,14 @@ pub fn empty(robot_id: &RobotId) -> DesiredWork {
 }
 
 /// A token of the robot, or of the task of its live attempt, stands.
-fn is_held(view: &View, robot_id: &RobotId) -> bool {
+fn is_held(view: &FleetProjection, robot_id: &RobotId) -> bool {
     let live = view.held_by(robot_id).and_then(|id| view.attempt(id)).filter(|a| !a.phase.is_terminal());
     let task = live.and_then(|a| a.attempt.subject.task_id()).and_then(|t| view.task(t));
     view.robot_holds(robot_id).next().is_some() || task.is_some_and(|t| !t.holds.is_empty())
 }
 
 fn assign(
-    view: &View,
+    view: &FleetProjection,
     a: &Attempt,
     old: Option<&Assignment>,
     live: Option<&Live>,
@@ -126,7 +126,7 @@ fn assign(
 }
 
 /// A new attempt, with the whole way through all its goals from where the robot is.
-fn begin(view: &View, a: &Attempt, live: Option<&Live>) -> Option<Assignment> {
+fn begin(view: &FleetProjection, a: &Attempt, live: Option<&Live>) -> Option<Assignment> {
     let here = routing::find(view, live.and_then(|l| l.report.vitals.waypoint.as_ref()));
     let (steps, timeout_ms, resume_step, speed) = match a.attempt.subject.task_id() {
         Some(task_id) => {
@@ -160,7 +160,7 @@ fn begin(view: &View, a: &Attempt, live: Option<&Live>) -> Option<Assignment> {
 /// Listed, and may not be entered: no session has this epoch. It is renewed with the robot's next heartbeat.
 const NOT_YET: Authority = Authority { session_epoch: 1, hb: 0, valid_ms: 1 };
 
-fn grants(view: &View, robot_id: &RobotId, old: &DesiredWork, board: &Board) -> Vec<GrantedPlace> {
+fn grants(view: &FleetProjection, robot_id: &RobotId, old: &DesiredWork, board: &Board) -> Vec<GrantedPlace> {
     let live = board.get(robot_id).map(|l| &**l);
     let listed = held(view, robot_id).filter(|(_, h)| h.state != HolderState::Revoking);
     listed
@@ -180,7 +180,13 @@ fn grants(view: &View, robot_id: &RobotId, old: &DesiredWork, board: &Board) -> 
         .collect()
 }
 
-fn resume(view: &View, robot_id: &RobotId, old: &DesiredWork, is_held: bool, board: &Board) -> Option<Authority> {
+fn resume(
+    view: &FleetProjection,
+    robot_id: &RobotId,
+    old: &DesiredWork,
+    is_held: bool,
+    board: &Board,
+) -> Option<Authority> {
     if is_held {
         return None;
     }
@@ -213,7 +219,7 @@ fn closed(
 }
 
 /// Robots whose permissions wear out while they stand unused.
-pub fn wearing(view: &View, board: &Board) -> Vec<RobotId> {
+pub fn wearing(view: &FleetProjection, board: &Board) -> Vec<RobotId> {
     let worn = |d: &DesiredWork| {
         let live = board.get(&d.robot_id).map(|l| &**l);
         if d.held && live.is_some() && !is_held(view, &d.robot_id) {

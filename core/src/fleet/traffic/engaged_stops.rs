@@ -1,6 +1,6 @@
 //! What the copy of the fleet stops says of now: which robots they keep work from, and which places they close.
 
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
 use crate::robot::StopLevel;
@@ -10,18 +10,18 @@ use crate::work::Live;
 use std::collections::BTreeSet;
 
 /// Stops that are engaged, as they were copied. What was reset is not looked at.
-pub(in crate::fleet) fn engaged(view: &View) -> impl Iterator<Item = &Stop> {
+pub(in crate::fleet) fn engaged(view: &FleetProjection) -> impl Iterator<Item = &Stop> {
     view.engaged.iter().filter_map(|id| view.stops.get(id)).map(|record| &record.row.stop)
 }
 
 /// Those that stand robots.
-fn standing(view: &View) -> impl Iterator<Item = &Stop> {
+fn standing(view: &FleetProjection) -> impl Iterator<Item = &Stop> {
     engaged(view).filter(|stop| stop.level >= StopLevel::Halt)
 }
 
 /// Of these, whom a robot lies inside of.
 pub(in crate::fleet) fn over<'v>(
-    view: &'v View,
+    view: &'v FleetProjection,
     robot_id: &'v RobotId,
     live: Option<&'v Live>,
 ) -> impl Iterator<Item = &'v Stop> {
@@ -30,7 +30,7 @@ pub(in crate::fleet) fn over<'v>(
 }
 
 /// Whether a stop keeps work from the robot, also before its token is written.
-pub(in crate::fleet) fn screen(view: &View, robot_id: &RobotId, live: Option<&Live>) -> Result<(), Reason> {
+pub(in crate::fleet) fn screen(view: &FleetProjection, robot_id: &RobotId, live: Option<&Live>) -> Result<(), Reason> {
     match over(view, robot_id, live).next() {
         Some(stop) => Err(Reason::from(Code::StopEngaged).with("stop_id", &stop.stop_id).with("scope", &stop.scope)),
         None => Ok(()),
@@ -38,7 +38,7 @@ pub(in crate::fleet) fn screen(view: &View, robot_id: &RobotId, live: Option<&Li
 }
 
 /// Places that lie inside of a stop of a part of the site: nobody is let into them.
-pub(in crate::fleet) fn closed(view: &View) -> BTreeSet<PlaceIx> {
+pub(in crate::fleet) fn closed(view: &FleetProjection) -> BTreeSet<PlaceIx> {
     let site: &Site = &view.site;
     let mut closed = BTreeSet::new();
     for stop in standing(view) {

@@ -11,7 +11,7 @@ use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::memory::Waiting;
 use crate::fleet::projection::rows::{HolderState, Place, PlaceHolder, RobotControl};
-use crate::fleet::projection::state::{self, View};
+use crate::fleet::projection::state::{self, FleetProjection};
 use crate::fleet::tasks::plausible;
 use crate::ids::{AreaId, PlaceId, RobotId};
 use crate::limits;
@@ -31,12 +31,12 @@ const STEP_ASIDE_AFTER: SiteDuration = SiteDuration::from_secs(3);
 const GRANTS_PER_GENERATION: u64 = 1024;
 
 /// Whether the robot stands because it waits for a place.
-pub fn waits(view: &View, robot_id: &RobotId) -> bool {
+pub fn waits(view: &FleetProjection, robot_id: &RobotId) -> bool {
     view.waits.contains_key(robot_id)
 }
 
 /// Robots that hold a standing place in the area.
-pub fn robots_in_area(view: &View, area: &AreaId) -> BTreeSet<RobotId> {
+pub fn robots_in_area(view: &FleetProjection, area: &AreaId) -> BTreeSet<RobotId> {
     let inside = |id: &str| {
         let place = PlaceId::parse(id).ok().and_then(|p| view.site.find_place(&p)).map(|p| view.site.place(p));
         place.and_then(|p| p.waypoint()).is_some_and(|w| view.site.area_of(w).area_id == *area)
@@ -53,7 +53,7 @@ struct Wish {
 }
 
 /// Serves every robot that needs more of its route, in queue order. Each grant is an item of its own.
-pub fn advance(view: &mut View, board: &Board, now: Now, plan: &mut Plan) -> Releases {
+pub fn advance(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan) -> Releases {
     let mut wishes: Vec<Wish> = Vec::new();
     for (robot_id, live) in board {
         let Some(id) = view.held_by(robot_id) else { continue };
@@ -85,7 +85,7 @@ pub fn advance(view: &mut View, board: &Board, now: Now, plan: &mut Plan) -> Rel
 }
 
 /// The robot is inside a passage and has no standing place to go on to: its task ended there.
-fn bars_passage(view: &View, robot_id: &RobotId) -> bool {
+fn bars_passage(view: &FleetProjection, robot_id: &RobotId) -> bool {
     let mut inside = false;
     for (place, holder) in state::held(view, robot_id) {
         if place.standing {
@@ -96,13 +96,13 @@ fn bars_passage(view: &View, robot_id: &RobotId) -> bool {
     inside
 }
 
-fn class_of(view: &View, a: &Attempt) -> Class {
+fn class_of(view: &FleetProjection, a: &Attempt) -> Class {
     let priority = a.attempt.subject.task_id().and_then(|t| view.intake(t)).map_or(9, |i| i.spec.priority);
     Class::of(priority, 0)
 }
 
 /// An accepted attempt of a robot that is heard, not held and not told to stop.
-fn may_drive(view: &View, a: &Attempt, live: &Live, board: &Board, now: &Now) -> bool {
+fn may_drive(view: &FleetProjection, a: &Attempt, live: &Live, board: &Board, now: &Now) -> bool {
     let working = matches!(
         a.phase,
         AttemptPhase::Accepted | AttemptPhase::Navigating | AttemptPhase::Executing | AttemptPhase::Paused
@@ -114,19 +114,19 @@ fn may_drive(view: &View, a: &Attempt, live: &Live, board: &Board, now: &Now) ->
     working && session && !held && a.uncertain.is_none() && liveness::presence(board, robot_id, now) == Presence::Online
 }
 
-fn assignment<'a>(view: &'a View, robot_id: &RobotId, a: &Attempt) -> Option<&'a Assignment> {
+fn assignment<'a>(view: &'a FleetProjection, robot_id: &RobotId, a: &Attempt) -> Option<&'a Assignment> {
     let desired = &view.desired_work.get(robot_id.as_str())?.row;
     desired.assignment.as_ref().filter(|x| x.attempt == a.attempt)
 }
 
-fn is_released(view: &View, robot_id: &RobotId, a: &Attempt) -> bool {
+fn is_released(view: &FleetProjection, robot_id: &RobotId, a: &Attempt) -> bool {
     let Some(work) = assignment(view, robot_id, a) else { return true };
     let end = work.route.len().saturating_sub(1) as u32;
     work.released_index.is_some_and(|r| r >= end) || next_segment(view, robot_id, a, work).is_none()
 }
 
 /// The robot stands at the end of what was released to it, and there is more that could be.
-pub fn is_out_of_route(view: &View, live: &Live, a: &Attempt) -> bool {
+pub fn is_out_of_route(view: &FleetProjection, live: &Live, a: &Attempt) -> bool {
     let Some(work) = assignment(view, &live.robot_id, a) else { return false };
     let Some(listed) = live.report.attempts.iter().find(|r| r.attempt == a.attempt) else { return false };
     let released = work.released_index.unwrap_or(0);
@@ -135,7 +135,7 @@ pub fn is_out_of_route(view: &View, live: &Live, a: &Attempt) -> bool {
 }
 
 /// The next stretch to release, if it is time for it: not before the step behind the last one is done, and at most one ahead.
-fn next_segment(view: &View, robot_id: &RobotId, a: &Attempt, work: &Assignment) -> Option<Segment> {
+fn next_segment(view: &FleetProjection, robot_id: &RobotId, a: &Attempt, work: &Assignment) -> Option<Segment> {
     let route = routing::indices(&view.site, &work.route)?;
     let released = work.released_index.unwrap_or(0) as usize;
     let segment = segments(&view.site, &route).into_iter().find(|s| s.end > released)?;
@@ -160,7 +160,7 @@ struct Traffic {
 }
 
 impl Traffic {
-    fn of(view: &View) -> Self {
+    fn of(view: &FleetProjection) -> Self {
         let mut traffic = Self { blocked: engaged_stops::closed(view), ..Self::default() };
         let standing = view.site.places().iter().filter(|p| p.waypoint().is_some());
         for place in standing {
@@ -174,12 +174,12 @@ impl Traffic {
         }
         traffic
     }
-    fn enter(&mut self, view: &View, robot_id: &RobotId, place: &crate::site::Place) {
+    fn enter(&mut self, view: &FleetProjection, robot_id: &RobotId, place: &crate::site::Place) {
         let Some(area) = place.waypoint().map(|w| view.site.waypoint(w).area) else { return };
         self.inside.entry(area).or_default().insert(robot_id.clone());
     }
     /// An area admits one robot less than it has seats, so that those inside can move.
-    fn admits(&self, view: &View, robot_id: &RobotId, place: &crate::site::Place) -> bool {
+    fn admits(&self, view: &FleetProjection, robot_id: &RobotId, place: &crate::site::Place) -> bool {
         let Some(area) = place.waypoint().map(|w| view.site.waypoint(w).area) else { return true };
         let Some(inside) = self.inside.get(&area).filter(|inside| !inside.contains(robot_id)) else { return true };
         (inside.len() as u64) < view.site.area_capacity(area).saturating_sub(1).max(1)
@@ -241,7 +241,7 @@ fn note_wait(tx: &mut Tx, robot_id: &RobotId, since: SiteTime) {
 
 /// Places that a wish keeps free for itself. While there is no seat where it goes to, only that seat: who leaves the seat may need the same
 /// passage. While the area there admits nobody, nothing: who is inside may need the seat.
-fn kept_free(view: &View, robot_id: &RobotId, needed: &[PlaceIx], traffic: &Traffic) -> Vec<PlaceIx> {
+fn kept_free(view: &FleetProjection, robot_id: &RobotId, needed: &[PlaceIx], traffic: &Traffic) -> Vec<PlaceIx> {
     let place = |ix: &PlaceIx| view.site.place(*ix);
     if !needed.iter().all(|ix| traffic.admits(view, robot_id, place(ix))) {
         return Vec::new();
@@ -251,14 +251,14 @@ fn kept_free(view: &View, robot_id: &RobotId, needed: &[PlaceIx], traffic: &Traf
     if seats.iter().all(is_free) { [seats, passages].concat() } else { seats }
 }
 
-fn has_seat(view: &View, robot_id: &RobotId, ix: PlaceIx) -> bool {
+fn has_seat(view: &FleetProjection, robot_id: &RobotId, ix: PlaceIx) -> bool {
     let place = view.places.get(view.site.place(ix).place_id.as_str()).map(|p| &p.row);
     place.is_some_and(|p| p.holder(robot_id).is_some() || starts::has_room(view, ix, p, robot_id))
 }
 
 /// Places on the released stretch ahead that a standing robot does not hold: a passage that its route crosses a second time, or grants that
 /// it lost with its memory. Only a settled, newest report tells.
-fn missing(view: &View, live: &Live, a: &Attempt) -> Vec<PlaceIx> {
+fn missing(view: &FleetProjection, live: &Live, a: &Attempt) -> Vec<PlaceIx> {
     let standing = live.report.vitals.speed_mm_s == 0;
     let Some(reported) = live.report.attempts.iter().find(|r| r.attempt == a.attempt) else { return Vec::new() };
     let Some(work) = assignment(view, &live.robot_id, a) else { return Vec::new() };
@@ -273,7 +273,7 @@ fn missing(view: &View, live: &Live, a: &Attempt) -> Vec<PlaceIx> {
     lost.into_iter().collect()
 }
 
-fn grantable(view: &View, robot_id: &RobotId, needed: &[PlaceIx], traffic: &Traffic) -> bool {
+fn grantable(view: &FleetProjection, robot_id: &RobotId, needed: &[PlaceIx], traffic: &Traffic) -> bool {
     let held = view.held_places.get(robot_id).map_or(0, BTreeSet::len);
     if held + needed.len() > limits::PLACES_OF_ROBOT_MAX {
         return false;
@@ -369,7 +369,7 @@ fn step_aside(
     false
 }
 
-fn stands_in(view: &View, robot_id: &RobotId, place: PlaceIx) -> bool {
+fn stands_in(view: &FleetProjection, robot_id: &RobotId, place: PlaceIx) -> bool {
     let id = &view.site.place(place).place_id;
     view.places.get(id.as_str()).and_then(|p| p.row.holder(robot_id)).is_some_and(|h| h.state == HolderState::Inside)
 }

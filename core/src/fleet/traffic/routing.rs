@@ -1,7 +1,7 @@
 //! Routes as robots get them: from where a robot stands through every goal that is left, around places that are closed.
 
 use super::engaged_stops;
-use crate::fleet::projection::state::View;
+use crate::fleet::projection::state::FleetProjection;
 use crate::ids::WaypointId;
 use crate::limits;
 use crate::site::route::Blocked;
@@ -9,7 +9,7 @@ use crate::site::{Site, WaypointIx};
 use crate::work::{RoutePoint, StepKind, WorkStep};
 
 /// Places that no route may lead into now: found once, until a place or a stop changes.
-pub fn closed(view: &View) -> &Blocked {
+pub fn closed(view: &FleetProjection) -> &Blocked {
     view.closed_places.get_or_init(|| {
         let quarantined = view.places.values().filter(|p| p.row.quarantine.is_some());
         let quarantined = quarantined.filter_map(|p| view.site.find_place(&p.row.place_id));
@@ -29,7 +29,7 @@ pub fn goals(site: &Site, steps: &[WorkStep], from_step: u32) -> Option<Vec<(u32
 
 /// The route from `start` through `goals`, with the ways between them; none if no lanes lead there.
 pub fn route(
-    view: &View,
+    view: &FleetProjection,
     start: WaypointIx,
     via: Option<WaypointIx>,
     goals: &[(u32, WaypointIx)],
@@ -57,7 +57,7 @@ pub fn route(
 
 /// Whether a route of `work_mm` through all goals would have too many points. A bound decides for nearly all: only what might be too
 /// long is counted.
-pub fn is_too_long(view: &View, start: WaypointIx, goals: &[WaypointIx], work_mm: u64) -> bool {
+pub fn is_too_long(view: &FleetProjection, start: WaypointIx, goals: &[WaypointIx], work_mm: u64) -> bool {
     let most = work_mm / u64::from(view.site.shortest_lane_mm()) + 2 * goals.len() as u64 + 1;
     most > limits::ROUTE_POINTS_MAX as u64
         && route(view, start, None, &goals.iter().map(|goal| (0, *goal)).collect::<Vec<_>>()).is_none()
@@ -86,12 +86,12 @@ pub fn indices(site: &Site, route: &[RoutePoint]) -> Option<Vec<WaypointIx>> {
 }
 
 /// Millimetres to each of the goals from the one before it, in order.
-pub fn legs_mm(view: &View, start: WaypointIx, goals: &[WaypointIx]) -> Option<Vec<u64>> {
+pub fn legs_mm(view: &FleetProjection, start: WaypointIx, goals: &[WaypointIx]) -> Option<Vec<u64>> {
     let starts = std::iter::once(&start).chain(goals);
     starts.zip(goals).map(|(at, goal)| view.router.distance_mm(*at, *goal)).collect()
 }
 
 /// Index of a waypoint by name.
-pub fn find(view: &View, name: Option<&WaypointId>) -> Option<WaypointIx> {
+pub fn find(view: &FleetProjection, name: Option<&WaypointId>) -> Option<WaypointIx> {
     name.and_then(|n| view.site.find(n))
 }

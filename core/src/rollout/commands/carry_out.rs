@@ -1,7 +1,7 @@
 //! Carries out what people ask of roll-outs: write one down, check it, stand for it, begin, stand still, go on, judge,
 //! end, take back; and of robots: pin, leave out, lift a quarantine, go back once more.
 //!
-//! Invariant: a command is checked against the whole picture before anything of it is written; asked twice it does the
+//! Invariant: a command is checked against the whole projection before anything of it is written; asked twice it does the
 //! same once.
 
 use super::audit::{note, note_of_verb};
@@ -26,7 +26,7 @@ use crate::rollout::projection::rows::{
     Act, Bundle, Counted, Outcome, Pause, Phase, Quarantine, RobotSoftware, Rollout, RolloutRobot, Verdict,
 };
 use crate::rollout::projection::spec::{RolloutSpec, Wave};
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use crate::rollout::robots::machine::Move;
 use crate::rollout::robots::moves;
 use crate::rows::Writer;
@@ -39,7 +39,13 @@ use std::sync::Arc;
 ///
 /// # Errors
 /// Why not; whoever asks may not; a request_id that was used for something else.
-pub fn decide_request(view: &mut View, board: &Board, now: Now, ask: &Ask, plan: &mut Plan) -> Result<Taken, Refusal> {
+pub fn decide_request(
+    view: &mut RolloutProjection,
+    board: &Board,
+    now: Now,
+    ask: &Ask,
+    plan: &mut Plan,
+) -> Result<Taken, Refusal> {
     let Ask { command, seen, check_only, request_id, by } = ask;
     let actor = &Actor::from(by);
     // For the audit, also if whoever asks may not. What it may not even see is about nothing that there is, and leaves
@@ -79,7 +85,7 @@ pub fn decide_request(view: &mut View, board: &Board, now: Now, ask: &Ask, plan:
 
 /// Carries out a command that passed its check: one item for most, many for a start.
 pub(in crate::rollout) fn carry_out(
-    view: &mut View,
+    view: &mut RolloutProjection,
     board: &Board,
     now: Now,
     command: &Command,
@@ -241,7 +247,15 @@ fn carry_out_verb(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor
     }
 }
 
-fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bool, actor: &Actor, plan: &mut Plan) {
+fn start(
+    view: &mut RolloutProjection,
+    board: &Board,
+    now: Now,
+    id: &RolloutId,
+    supersede: bool,
+    actor: &Actor,
+    plan: &mut Plan,
+) {
     let Some(rollout) = view.rollout(id).cloned() else { return };
     let Ok((robots, sizes)) = members_to_start(view, board, &rollout) else { return };
     let others = find_overlapping(view, &rollout, robots.iter().map(|(id, ..)| id));
@@ -289,7 +303,7 @@ fn start(view: &mut View, board: &Board, now: Now, id: &RolloutId, supersede: bo
     }
 }
 
-fn retry_failed(view: &mut View, now: Now, id: &RolloutId, actor: &Actor, reason: &str, plan: &mut Plan) {
+fn retry_failed(view: &mut RolloutProjection, now: Now, id: &RolloutId, actor: &Actor, reason: &str, plan: &mut Plan) {
     let Some(rollout) = view.rollout(id).cloned() else { return };
     let wave = rollout.spec.waves.len() as u32 + 1;
     let robots: Vec<RolloutRobot> = view.robots_of(id).filter(|r| is_to_retry(r)).cloned().collect();

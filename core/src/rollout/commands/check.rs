@@ -10,7 +10,7 @@ use crate::reason::{Code, Kind, Reason, Refusal, Violations};
 use crate::rollout::members::matching::is_kept;
 use crate::rollout::projection::requests::{Command, Verb};
 use crate::rollout::projection::rows::{Pause, Phase, Quarantine, Rollout, RolloutRobot, Step};
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use crate::rollout::robots::due::is_irreversible;
 use crate::rows::Revision;
 
@@ -23,7 +23,7 @@ fn not_found(code: Code, key: &str, id: &impl ToString) -> Refusal {
 /// # Errors
 /// Why not.
 pub(in crate::rollout) fn check_command(
-    view: &View,
+    view: &RolloutProjection,
     board: &Board,
     command: &Command,
     seen: Option<Revision>,
@@ -104,11 +104,14 @@ pub(in crate::rollout) fn check_command(
 }
 
 /// The robot in each roll-out that it could not go back from.
-pub(super) fn stuck_robots<'a>(view: &'a View, robot_id: &'a RobotId) -> impl Iterator<Item = &'a RolloutRobot> {
+pub(super) fn stuck_robots<'a>(
+    view: &'a RolloutProjection,
+    robot_id: &'a RobotId,
+) -> impl Iterator<Item = &'a RolloutRobot> {
     view.rows_of_robot(robot_id).filter(|r| r.step == Step::Stuck)
 }
 
-fn has_room(view: &View) -> Result<bool, Refusal> {
+fn has_room(view: &RolloutProjection) -> Result<bool, Refusal> {
     let open = view.rollouts.values().filter(|r| !r.row.phase.is_over()).count();
     if open >= limits::ROLLOUTS_OPEN_MAX {
         return Err(Refusal::new(Kind::Exhausted, Reason::from(Code::Overloaded).with("rollouts_open", open)));
@@ -117,7 +120,7 @@ fn has_room(view: &View) -> Result<bool, Refusal> {
 }
 
 /// True: it was done before.
-fn verb_fits(view: &View, board: &Board, rollout: &Rollout, verb: &Verb) -> Result<bool, Refusal> {
+fn verb_fits(view: &RolloutProjection, board: &Board, rollout: &Rollout, verb: &Verb) -> Result<bool, Refusal> {
     let phase = rollout.phase;
     let now_is = |fits: bool, done: bool| {
         let reason = || {
@@ -182,7 +185,7 @@ pub(super) fn is_to_retry(r: &RolloutRobot) -> bool {
     matches!(r.step, Step::RolledBack | Step::Skipped) && r.why.as_ref().is_none_or(|w| w.code != Code::SkippedExcluded)
 }
 
-fn may_start(view: &View, board: &Board, rollout: &Rollout, supersede: bool) -> Result<(), Refusal> {
+fn may_start(view: &RolloutProjection, board: &Board, rollout: &Rollout, supersede: bool) -> Result<(), Refusal> {
     let (robots, _) = members_to_start(view, board, rollout)?;
     let others = find_overlapping(view, rollout, robots.iter().map(|(id, ..)| id));
     match others.iter().next() {

@@ -9,7 +9,7 @@ use crate::rollout::judgement::verdict::{self, ActsOnRates};
 use crate::rollout::members::matching::{self, Matched, Matching, Members};
 use crate::rollout::projection::rows::{Bundle, Rollout};
 use crate::rollout::projection::spec::{RolloutSpec, Wave};
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use crate::task::raw::parse_version;
 use crate::update::Installed;
 use std::collections::BTreeSet;
@@ -39,7 +39,7 @@ pub struct DryRun {
 ///
 /// # Errors
 /// None is called so, or it was taken back.
-pub fn find_bundle<'a>(view: &'a View, id: &BundleId) -> Result<&'a Bundle, Refusal> {
+pub fn find_bundle<'a>(view: &'a RolloutProjection, id: &BundleId) -> Result<&'a Bundle, Refusal> {
     let bundle = view.bundles.get(id.as_str()).map(|b| &b.row);
     let bundle =
         bundle.ok_or_else(|| Refusal::new(Kind::NotFound, Reason::from(Code::BundleNotFound).with("bundle", id)))?;
@@ -68,7 +68,7 @@ pub fn meets_floor(bundle: &Bundle, spec: &RolloutSpec) -> Result<(), Refusal> {
 /// # Errors
 /// A bundle that is not there; rules that are broken; a floor above the bundle; nobody matched; a first wave that is
 /// too large; a budget that lets nobody out.
-pub fn dry_run(view: &View, board: &Board, id: &RolloutId, spec: &RolloutSpec) -> Result<DryRun, Refusal> {
+pub fn dry_run(view: &RolloutProjection, board: &Board, id: &RolloutId, spec: &RolloutSpec) -> Result<DryRun, Refusal> {
     let mut bad = Violations::default();
     spec.check(&mut bad);
     bad.finish()?;
@@ -96,7 +96,7 @@ pub fn dry_run(view: &View, board: &Board, id: &RolloutId, spec: &RolloutSpec) -
 }
 
 /// Areas whose rules let nobody out are told now, not when everybody waits.
-fn check_budgets(view: &View, matching: &Matching) -> Result<(), Refusal> {
+fn check_budgets(view: &RolloutProjection, matching: &Matching) -> Result<(), Refusal> {
     let areas: BTreeSet<_> = matching.robots.iter().filter_map(|r| r.stratum.area.as_ref()).collect();
     for area in areas {
         for (capability, least) in &view.policy(area).software.keep_in_work {
@@ -116,7 +116,7 @@ fn check_budgets(view: &View, matching: &Matching) -> Result<(), Refusal> {
     Ok(())
 }
 
-fn least_ms(view: &View, spec: &RolloutSpec, matching: &Matching) -> u64 {
+fn least_ms(view: &RolloutProjection, spec: &RolloutSpec, matching: &Matching) -> u64 {
     let each = PLANNED_OFF_WORK_MS + spec.probation_ms;
     let areas: BTreeSet<_> = matching.robots.iter().map(|r| r.stratum.area.clone()).collect();
     let wave = |wave: u32, size: u32| {
@@ -133,7 +133,13 @@ fn least_ms(view: &View, spec: &RolloutSpec, matching: &Matching) -> u64 {
     (0..).zip(matching.sizes(spec.waves.len())).filter(|(_, size)| *size > 0).map(|(ix, size)| wave(ix, size)).sum()
 }
 
-fn find_caveats(view: &View, board: &Board, spec: &RolloutSpec, bundle: &Bundle, matching: &Matching) -> Vec<String> {
+fn find_caveats(
+    view: &RolloutProjection,
+    board: &Board,
+    spec: &RolloutSpec,
+    bundle: &Bundle,
+    matching: &Matching,
+) -> Vec<String> {
     let mut caveats = Vec::new();
     if spec.probation_ms < SHORT_PROBATION_MS {
         caveats.push(format!(
@@ -202,7 +208,7 @@ fn lacks(installed: &Installed, name: &str, version: &str) -> bool {
 }
 
 /// Roll-outs that would end if this one began in their place.
-pub(super) fn find_superseded(view: &View, board: &Board, rollout_id: &RolloutId) -> BTreeSet<RolloutId> {
+pub(super) fn find_superseded(view: &RolloutProjection, board: &Board, rollout_id: &RolloutId) -> BTreeSet<RolloutId> {
     let known =
         view.rollout(rollout_id).and_then(|rollout| Some((rollout, members_to_start(view, board, rollout).ok()?)));
     known
@@ -214,7 +220,7 @@ pub(super) fn find_superseded(view: &View, board: &Board, rollout_id: &RolloutId
 ///
 /// # Errors
 /// Its dry run is refused, or the roll-out that it takes back is not there.
-pub(super) fn members_to_start(view: &View, board: &Board, rollout: &Rollout) -> Result<Members, Refusal> {
+pub(super) fn members_to_start(view: &RolloutProjection, board: &Board, rollout: &Rollout) -> Result<Members, Refusal> {
     match &rollout.revert_of {
         Some(of) => {
             view.rollout(of).ok_or_else(|| {
@@ -230,7 +236,7 @@ pub(super) fn members_to_start(view: &View, board: &Board, rollout: &Rollout) ->
 
 /// Roll-outs that run and have one of these robots.
 pub(super) fn find_overlapping<'a>(
-    view: &View,
+    view: &RolloutProjection,
     rollout: &Rollout,
     robots: impl Iterator<Item = &'a RobotId>,
 ) -> BTreeSet<RolloutId> {

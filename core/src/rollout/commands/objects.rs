@@ -10,7 +10,7 @@ use crate::ids::{RobotId, RolloutId};
 use crate::reason::{Code, Kind, Reason, Refusal};
 use crate::rollout::projection::requests::{Command, Verb};
 use crate::rollout::projection::rows::{Quarantine, Rollout};
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 
 fn missing(code: Code, key: &str, id: &impl ToString) -> Refusal {
     Refusal::new(Kind::NotFound, Reason::from(code).with(key, id.to_string()))
@@ -22,7 +22,7 @@ pub fn sees(by: &Caller, rollout: &Rollout) -> bool {
 }
 
 /// Whether a caller may see a robot.
-pub fn sees_robot(view: &View, board: &Board, by: &Caller, robot_id: &RobotId) -> bool {
+pub fn sees_robot(view: &RolloutProjection, board: &Board, by: &Caller, robot_id: &RobotId) -> bool {
     let area = || board.get(robot_id).and_then(|live| view.area_of(live));
     by.may_everywhere(Permission::Read) || by.may_over(Permission::Read, area().as_ref())
 }
@@ -31,12 +31,17 @@ pub fn sees_robot(view: &View, board: &Board, by: &Caller, robot_id: &RobotId) -
 ///
 /// # Errors
 /// It is not there, or may not be seen.
-pub fn find_seen<'v>(view: &'v View, by: &Caller, rollout_id: &RolloutId) -> Result<&'v Rollout, Refusal> {
+pub fn find_seen<'v>(view: &'v RolloutProjection, by: &Caller, rollout_id: &RolloutId) -> Result<&'v Rollout, Refusal> {
     let found = view.rollout(rollout_id).filter(|rollout| sees(by, rollout));
     found.ok_or_else(|| missing(Code::RolloutNotFound, "rollout_id", rollout_id))
 }
 
-fn acts_on(view: &View, by: &Caller, permission: Permission, rollout_id: &RolloutId) -> Result<(), Refusal> {
+fn acts_on(
+    view: &RolloutProjection,
+    by: &Caller,
+    permission: Permission,
+    rollout_id: &RolloutId,
+) -> Result<(), Refusal> {
     let Some(rollout) = view.rollout(rollout_id) else { return Ok(()) };
     let areas = &rollout.spec.selector.areas;
     by.acts_on(permission, areas, || missing(Code::RolloutNotFound, "rollout_id", rollout_id))
@@ -46,7 +51,7 @@ fn acts_on(view: &View, by: &Caller, permission: Permission, rollout_id: &Rollou
 ///
 /// # Errors
 /// It may not see what it is about, may not do that to it, or would approve what it wrote.
-pub fn permit(view: &View, board: &Board, by: &Caller, command: &Command) -> Result<(), Refusal> {
+pub fn permit(view: &RolloutProjection, board: &Board, by: &Caller, command: &Command) -> Result<(), Refusal> {
     let author = Permission::Author;
     match command {
         Command::Create { spec, .. } => {
@@ -92,13 +97,19 @@ pub fn permit(view: &View, board: &Board, by: &Caller, command: &Command) -> Res
     }
 }
 
-fn acts_on_robot(view: &View, board: &Board, by: &Caller, robot_id: &RobotId, code: Code) -> Result<(), Refusal> {
+fn acts_on_robot(
+    view: &RolloutProjection,
+    board: &Board,
+    by: &Caller,
+    robot_id: &RobotId,
+    code: Code,
+) -> Result<(), Refusal> {
     let area = board.get(robot_id).and_then(|live| view.area_of(live));
     by.acts_on(Permission::Author, area.as_ref(), || missing(code, "robot_id", robot_id))
 }
 
 /// Refuses a person that wrote the roll-out itself. Where nobody signs in there is nobody else.
-fn needs_another_person(view: &View, by: &Caller, rollout_id: &RolloutId) -> Result<(), Refusal> {
+fn needs_another_person(view: &RolloutProjection, by: &Caller, rollout_id: &RolloutId) -> Result<(), Refusal> {
     let Some(rollout) = view.rollout(rollout_id) else { return Ok(()) };
     if matches!(by.who(), Who::Local) || rollout.created.person() != by.person() {
         return Ok(());

@@ -6,12 +6,12 @@ use crate::identity::Actor;
 use crate::ids::RobotId;
 use crate::maintenance::INCIDENT;
 use crate::reason::Reason;
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use crate::rows::Item;
 use crate::time::Now;
 
 /// A decision of the rollout service under way.
-pub type Tx<'a> = crate::picture::Tx<'a, View>;
+pub type Tx<'a> = crate::projection::Tx<'a, RolloutProjection>;
 
 /// Items to commit, in order, and what could not be read.
 #[derive(Debug, Default)]
@@ -24,7 +24,13 @@ pub struct Plan {
 
 impl Plan {
     /// Makes one decision; nothing is added if it changed nothing, or if it touches a row of a newer version.
-    pub fn decide(&mut self, view: &mut View, now: Now, actor: impl Into<Actor>, decision: impl FnOnce(&mut Tx)) {
+    pub fn decide(
+        &mut self,
+        view: &mut RolloutProjection,
+        now: Now,
+        actor: impl Into<Actor>,
+        decision: impl FnOnce(&mut Tx),
+    ) {
         let mut tx = Tx::new(view, now, actor);
         decision(&mut tx);
         if tx.unknown_row().is_some() {

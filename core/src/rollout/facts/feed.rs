@@ -3,12 +3,12 @@
 //! Invariant: an entry of the inbox is obeyed once; the item that obeys it writes how far the feed is consumed.
 
 use super::reports;
-use crate::picture;
+use crate::projection;
 use crate::reason::{Code, Reason};
 use crate::rollout::decision::plan::{Plan, Tx, incident};
 use crate::rollout::projection::ended;
 use crate::rollout::projection::rows::OtaMark;
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use crate::rows::{BadRow, Entry, Item, Key, Log, Revision, Row, Seq, Table};
 use crate::time::Now;
 use crate::work::InboxEntry;
@@ -18,11 +18,11 @@ pub const LOGS: &[Log] = &[Log::Ota, Log::Fleet, Log::Telemetry, Log::RobotInbox
 
 /// Entry of the log that an item obeys, if it obeys one.
 pub fn obeyed(item: &Item) -> Option<Seq> {
-    picture::written::<OtaMark>(item).map(|mark| mark.seq)
+    projection::written::<OtaMark>(item).map(|mark| mark.seq)
 }
 
 /// Takes entries of the feed, in commit order: rows into the view, robots' events into decisions.
-pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
+pub fn absorb(view: &mut RolloutProjection, now: Now, entries: &[Entry], plan: &mut Plan) {
     let consumed = view.marks.get("ota").map_or(Seq(0), |m| m.row.seq);
     for entry in entries {
         take_row(view, entry, &mut plan.unreadable);
@@ -54,11 +54,11 @@ pub fn absorb(view: &mut View, now: Now, entries: &[Entry], plan: &mut Plan) {
     }
 }
 
-fn take_row(view: &mut View, entry: &Entry, unreadable: &mut Vec<String>) {
+fn take_row(view: &mut RolloutProjection, entry: &Entry, unreadable: &mut Vec<String>) {
     let table = entry.table.filter(|_| entry.seq > view.read_at);
     if let Some(table) = table.filter(|table| !ended::is_elsewhere(view, entry, *table)) {
         let key = Key { table, id: entry.subject.clone() };
-        if let Err(error) = view.take_row(&key, entry.revision, picture::row_of(entry, table).as_ref()) {
+        if let Err(error) = view.take_row(&key, entry.revision, projection::row_of(entry, table).as_ref()) {
             unreadable.push(error.to_string());
         }
     }
@@ -67,7 +67,7 @@ fn take_row(view: &mut View, entry: &Entry, unreadable: &mut Vec<String>) {
 
 /// Takes entries of the feed as somebody does who decides nothing: rows only. What a planner would have to look at is
 /// not gathered.
-pub fn follow_rows(view: &mut View, now: Now, entries: &[Entry], unreadable: &mut Vec<String>) {
+pub fn follow_rows(view: &mut RolloutProjection, now: Now, entries: &[Entry], unreadable: &mut Vec<String>) {
     for entry in entries {
         take_row(view, entry, unreadable);
         if entry.table == Some(Table::OtaClock) {
@@ -82,7 +82,7 @@ pub fn follow_rows(view: &mut View, now: Now, entries: &[Entry], unreadable: &mu
 ///
 /// # Errors
 /// A row that cannot be read.
-pub fn reread(view: &mut View, keys: &[Key], rows: &[Row]) -> Result<(), BadRow> {
+pub fn reread(view: &mut RolloutProjection, keys: &[Key], rows: &[Row]) -> Result<(), BadRow> {
     for key in keys {
         view.take_row(key, Revision(u64::MAX), None)?;
         if let Some(row) = rows.iter().find(|row| row.key == *key) {
@@ -94,7 +94,7 @@ pub fn reread(view: &mut View, keys: &[Key], rows: &[Row]) -> Result<(), BadRow>
 }
 
 /// States that a signed file is damaged on the server's disk.
-pub fn tell_damaged(view: &mut View, now: Now, digest: &str, plan: &mut Plan) {
+pub fn tell_damaged(view: &mut RolloutProjection, now: Now, digest: &str, plan: &mut Plan) {
     let reason = Reason::from(Code::SoftwareDamaged).with("digest", digest);
     plan.decide(view, now, "ota", |tx| incident(tx, None, &reason));
 }

@@ -11,7 +11,7 @@ use crate::rollout::decision::plan::Tx;
 use crate::rollout::judgement::failures::fail;
 use crate::rollout::projection::queue::is_directive_old;
 use crate::rollout::projection::rows::{RobotSoftware, RolloutRobot, Step};
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use crate::rollout::robots::moves;
 use crate::update::{UpdateEvent, UpdateReport, UpdateState};
 use crate::work::{InboxEntry, InboxItem, Live, RobotEvent, SampleBody};
@@ -69,7 +69,7 @@ fn note_ready(tx: &mut Tx, robot_id: &RobotId, drain_id: &DrainId) {
 }
 
 /// The robot in the roll-out whose drain this is. A robot that speaks of a drain of before is not heard.
-fn in_drain<'a>(view: &'a View, robot_id: &'a RobotId, drain_id: &DrainId) -> Option<&'a RolloutRobot> {
+fn in_drain<'a>(view: &'a RolloutProjection, robot_id: &'a RobotId, drain_id: &DrainId) -> Option<&'a RolloutRobot> {
     let any = view.bugs.any_drain_will_do();
     view.rows_of_robot(robot_id).find(|r| r.drain_id.as_ref() == Some(drain_id) || (any && r.drain_id.is_some()))
 }
@@ -99,7 +99,7 @@ fn note_way_back_refused(tx: &mut Tx, robot_id: &RobotId, generation: u64, reaso
 }
 
 /// The robot in the roll-out whose bundle it runs.
-fn on_trial(view: &View, robot_id: &RobotId) -> Option<RolloutRobot> {
+fn on_trial(view: &RolloutProjection, robot_id: &RobotId) -> Option<RolloutRobot> {
     view.rows_of_robot(robot_id).find(|r| matches!(r.step, Step::Activating | Step::Trial | Step::Committing)).cloned()
 }
 
@@ -123,7 +123,7 @@ fn judge_hardware_stop(tx: &mut Tx, robot_id: &RobotId) {
 }
 
 /// Its newest report says that it works with what is on trial.
-fn says_trial(view: &View, robot_id: &RobotId) -> bool {
+fn says_trial(view: &RolloutProjection, robot_id: &RobotId) -> bool {
     let report = view.software.get(robot_id.as_str()).and_then(|s| s.row.report.as_ref());
     let row = on_trial(view, robot_id);
     report.zip(row).is_some_and(|(report, r)| {
@@ -150,7 +150,7 @@ pub fn repair(tx: &mut Tx, live: &Live) {
 }
 
 /// Whether [`repair`] would change something.
-pub fn is_repair_due(view: &View, live: &Live) -> bool {
+pub fn is_repair_due(view: &RolloutProjection, live: &Live) -> bool {
     let Some(known) = view.software.get(live.robot_id.as_str()).map(|s| &s.row) else { return true };
     let session = view.sessions.get(live.robot_id.as_str()).map(|s| s.row.inventory.software.as_str());
     let reported = match (&known.report, &live.report.update) {

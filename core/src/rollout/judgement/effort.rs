@@ -8,7 +8,7 @@ use crate::gates::{Effort, EffortLimits, Efforts};
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
 use crate::rollout::projection::rows::Rollout;
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 
 /// Of one robot with one version, since ever. How hot it was on an errand counts, and nothing else of one.
 fn count_effort(counter: &RobotCounter) -> Effort {
@@ -23,21 +23,21 @@ fn count_effort(counter: &RobotCounter) -> Effort {
 }
 
 /// Of one robot with the version of the roll-out, since ever.
-pub fn effort_of_robot(view: &View, rollout: &Rollout, robot_id: &RobotId) -> Effort {
+pub fn effort_of_robot(view: &RolloutProjection, rollout: &Rollout, robot_id: &RobotId) -> Effort {
     let Some(bundle) = view.bundles.get(rollout.spec.bundle.as_str()) else { return Effort::default() };
     let id = format!("{robot_id}@{}", bundle.row.version);
     view.counters.get(&id).map_or_else(Effort::default, |counter| count_effort(&counter.row))
 }
 
 /// Of all robots with any other version, since ever.
-pub fn effort_of_controls(view: &View, rollout: &Rollout) -> Effort {
+pub fn effort_of_controls(view: &RolloutProjection, rollout: &Rollout) -> Effort {
     let version = view.bundles.get(rollout.spec.bundle.as_str()).map(|b| b.row.version.as_str());
     let others = view.counters.values().map(|c| &c.row).filter(|c| Some(c.software.as_str()) != version);
     others.map(count_effort).fold(Effort::default(), Effort::plus)
 }
 
 /// What was seen of both sides by now.
-pub fn see_efforts(view: &View, rollout: &Rollout) -> Efforts {
+pub fn see_efforts(view: &RolloutProjection, rollout: &Rollout) -> Efforts {
     let on_trial = view.robots_of(&rollout.rollout_id).filter(|r| r.moments.on_trial.is_some());
     let trial = on_trial.map(|r| effort_of_robot(view, rollout, &r.robot_id).since(r.effort_before));
     let control = effort_of_controls(view, rollout).since(rollout.counted.effort);

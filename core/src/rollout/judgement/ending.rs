@@ -10,7 +10,7 @@ use crate::rollout::decision::plan::{Tx, incident};
 use crate::rollout::members::area_bundles::serve_newcomers;
 use crate::rollout::projection::queue::is_newcomer;
 use crate::rollout::projection::rows::{Ending, Phase, Rollout, RolloutRobot, Step};
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 
 const OFFERED_TO_NOBODY: &str = "A roll-out ended that was offered to no robot: people had excluded, pinned or retired \
      all of them, or it had none.";
@@ -26,7 +26,7 @@ pub struct Share {
 }
 
 /// Counts robots.
-pub fn count_share(view: &View, rollout: &Rollout) -> Share {
+pub fn count_share(view: &RolloutProjection, rollout: &Rollout) -> Share {
     let mut share = Share::default();
     for r in view.robots_of(&rollout.rollout_id).filter(|r| is_offered(rollout, r)) {
         share.offered += 1;
@@ -56,7 +56,7 @@ fn is_reached(rollout: &Rollout, r: &RolloutRobot) -> bool {
 }
 
 /// How a roll-out ends, or would as things are. One that was offered to nobody has brought nothing.
-pub fn judge_ending(view: &View, rollout: &Rollout) -> Ending {
+pub fn judge_ending(view: &RolloutProjection, rollout: &Rollout) -> Ending {
     let Share { offered, reached } = count_share(view, rollout);
     let enough =
         offered > 0 && u64::from(reached) * 100 >= u64::from(offered) * u64::from(rollout.spec.complete_percent);

@@ -11,12 +11,12 @@ use crate::ids::RobotId;
 use crate::limits;
 use crate::robot::{HardwareStop, Mode, Presence, StopLevel};
 use crate::rollout::projection::rows::{Rollout, RolloutRobot};
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use crate::time::{Now, SiteDuration};
 use crate::work::{Live, WorkState};
 
 /// Whether the bundle has jammed a robot on trial whose gate is open.
-pub fn is_blamed(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
+pub fn is_blamed(view: &RolloutProjection, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
     let long = r.moments.on_trial.is_some_and(|at| now.ms_since(at) >= limits::JAMMED_AFTER.as_ms());
     let waited = view.control.get(r.robot_id.as_str()).and_then(|control| control.row.waited_for_place);
     let since_wait = |stood: SiteDuration| waited.map_or(stood, |at| stood.min(SiteDuration(now.ms_since(at))));
@@ -30,7 +30,7 @@ fn is_long(stood: SiteDuration) -> bool {
 }
 
 /// How long a robot has stood with work that it may do. None: it has none, is not heard, or something else holds it.
-fn stood(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> Option<SiteDuration> {
+fn stood(view: &RolloutProjection, board: &Board, now: &Now, robot_id: &RobotId) -> Option<SiteDuration> {
     let live = board.get(robot_id).filter(|_| liveness::presence(board, robot_id, now) != Presence::Offline)?;
     let is_on_its_way =
         |state: WorkState| matches!(state, WorkState::Accepted | WorkState::Navigating | WorkState::Executing);
@@ -48,7 +48,7 @@ fn is_held(live: &Live) -> bool {
 }
 
 /// Most robots with work that do not try this bundle get on: those of its area, or of the site if those are too few.
-fn others_get_on(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
+fn others_get_on(view: &RolloutProjection, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {
     let area = |id: &RobotId| view.software.get(id.as_str()).and_then(|s| s.row.area.as_ref());
     let tries = |id: &RobotId| view.robot_of(&rollout.rollout_id, id).is_some_and(|other| other.step.is_active());
     let others = board.keys().filter(|id| **id != r.robot_id && !tries(id));

@@ -16,7 +16,7 @@ use crate::robot::{Duty, Presence};
 use crate::rollout::decision::plan::Tx;
 use crate::rollout::projection::rows::{Abort, Counted, Outcome, Rollout, RolloutRobot, Step, Verdict};
 use crate::rollout::projection::spec::{SmallWave, SmallWaveFailure};
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use crate::rollout::projection::timestamp::Stamp;
 use crate::time::{Now, Utc};
 use std::collections::{BTreeMap, BTreeSet};
@@ -35,7 +35,7 @@ pub struct Seen {
 }
 
 /// Tasks that a robot has ended with the roll-out's version, since ever.
-pub fn tasks_of_robot(view: &View, rollout: &Rollout, robot_id: &RobotId) -> TaskTally {
+pub fn tasks_of_robot(view: &RolloutProjection, rollout: &Rollout, robot_id: &RobotId) -> TaskTally {
     let Some(bundle) = view.bundles.get(rollout.spec.bundle.as_str()) else { return TaskTally::default() };
     let id = format!("{robot_id}@{}", bundle.row.version);
     view.counters.get(&id).map_or_else(TaskTally::default, |c| ended_tasks(&c.row))
@@ -53,7 +53,7 @@ fn tasks_since(now: TaskTally, before: TaskTally) -> TaskTally {
 }
 
 /// Tasks that a robot has ended on trial.
-pub fn exposure_of(view: &View, rollout: &Rollout, r: &RolloutRobot) -> TaskTally {
+pub fn exposure_of(view: &RolloutProjection, rollout: &Rollout, r: &RolloutRobot) -> TaskTally {
     match r.moments.on_trial {
         Some(_) => tasks_since(tasks_of_robot(view, rollout, &r.robot_id), r.before),
         None => TaskTally::default(),
@@ -61,7 +61,7 @@ pub fn exposure_of(view: &View, rollout: &Rollout, r: &RolloutRobot) -> TaskTall
 }
 
 /// Tasks that all robots have ended with any other version, since ever.
-pub fn tasks_of_controls(view: &View, rollout: &Rollout) -> TaskTally {
+pub fn tasks_of_controls(view: &RolloutProjection, rollout: &Rollout) -> TaskTally {
     let version = view.bundles.get(rollout.spec.bundle.as_str()).map(|b| b.row.version.as_str());
     let others = view.counters.values().map(|c| &c.row).filter(|c| Some(c.software.as_str()) != version);
     others.map(ended_tasks).fold(TaskTally::default(), TaskTally::plus)
@@ -91,7 +91,7 @@ pub fn count_tasks(tx: &mut Tx, id: &RolloutId) {
 
 /// Counts robots at the gate of its wave. Those on trial in this wave or before that are not dark count as having come
 /// through.
-pub fn count_wave(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Seen {
+pub fn count_wave(view: &RolloutProjection, board: &Board, now: &Now, rollout: &Rollout) -> Seen {
     count_robots(view, rollout, |r| r.wave <= rollout.wave && !is_unheard(board, now, r))
 }
 
@@ -101,7 +101,7 @@ pub fn is_unheard(board: &Board, now: &Now, r: &RolloutRobot) -> bool {
 }
 
 /// Counts robots. `came_through`: whether one on trial counts for the bundle.
-fn count_robots(view: &View, rollout: &Rollout, came_through: impl Fn(&RolloutRobot) -> bool) -> Seen {
+fn count_robots(view: &RolloutProjection, rollout: &Rollout, came_through: impl Fn(&RolloutRobot) -> bool) -> Seen {
     let mut seen = Seen::default();
     for r in view.robots_of(&rollout.rollout_id).filter(|r| r.attempted) {
         seen.attempted += 1;
@@ -140,7 +140,7 @@ pub fn compose_verdict(rollout: &Rollout, seen: &Seen, outcome: Outcome, reason:
 }
 
 /// Why the roll-out must end now, if it must. Looked at in every phase, also while it stands still.
-pub fn find_abort(view: &View, rollout: &Rollout) -> Option<(Reason, bool, Seen)> {
+pub fn find_abort(view: &RolloutProjection, rollout: &Rollout) -> Option<(Reason, bool, Seen)> {
     let seen = count_robots(view, rollout, |_| false);
     let failed = seen.outcomes.failed;
     let mut failures = view.robots_of(&rollout.rollout_id).filter_map(|r| r.failure.as_ref());
@@ -192,7 +192,7 @@ impl ActsOnRates {
 /// for or against it, also if they were given permission, so neither do their areas. Rules are read as they are now: a
 /// rule that is put while the roll-out runs holds at once, also for what was counted before. Nothing ends what is over,
 /// or takes something back.
-pub fn acts_on_rates(view: &View, rollout: &Rollout) -> Option<ActsOnRates> {
+pub fn acts_on_rates(view: &RolloutProjection, rollout: &Rollout) -> Option<ActsOnRates> {
     if rollout.phase.is_over() || rollout.revert_of.is_some() {
         return None;
     }
@@ -205,7 +205,7 @@ pub fn acts_on_rates(view: &View, rollout: &Rollout) -> Option<ActsOnRates> {
 }
 
 /// Those of the areas whose rules say that rates of task failures end roll-outs; none: no rules say so.
-pub fn areas_that_act<'a>(view: &View, areas: impl Iterator<Item = &'a AreaId>) -> Option<ActsOnRates> {
+pub fn areas_that_act<'a>(view: &RolloutProjection, areas: impl Iterator<Item = &'a AreaId>) -> Option<ActsOnRates> {
     let areas: BTreeSet<&AreaId> = areas.collect();
     let areas = areas.into_iter().filter(|area| view.policy(area).software.acts_on_rates);
     let areas: BTreeSet<AreaId> = areas.cloned().collect();
@@ -214,7 +214,7 @@ pub fn areas_that_act<'a>(view: &View, areas: impl Iterator<Item = &'a AreaId>) 
 
 /// What is latched when a roll-out ends early.
 pub fn compose_abort(
-    view: &View,
+    view: &RolloutProjection,
     rollout: &Rollout,
     reason: Reason,
     hard: bool,
@@ -230,24 +230,24 @@ pub fn compose_abort(
 
 /// Robots of the wave that have not worked enough to be judged, and may yet. Whom people or the breaker keep out of
 /// work is not waited for, unless nobody else of the wave has worked enough.
-pub fn find_unexposed<'a>(view: &'a View, rollout: &'a Rollout) -> impl Iterator<Item = &'a RolloutRobot> {
+pub fn find_unexposed<'a>(view: &'a RolloutProjection, rollout: &'a Rollout) -> impl Iterator<Item = &'a RolloutRobot> {
     let on_trial = || robots_of_wave(view, &rollout.rollout_id, rollout.wave).filter(|r| r.step == Step::Trial);
     let nobody = !on_trial().any(|r| has_worked(view, rollout, r));
     on_trial().filter(move |r| !has_worked(view, rollout, r) && (nobody || is_in_work(view, r)))
 }
 
 /// It has ended as many tasks on trial as it is judged by.
-fn has_worked(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
+fn has_worked(view: &RolloutProjection, rollout: &Rollout, r: &RolloutRobot) -> bool {
     exposure_of(view, rollout, r).ended() >= rollout.spec.exposure_tasks
 }
 
-fn is_in_work(view: &View, r: &RolloutRobot) -> bool {
+fn is_in_work(view: &RolloutProjection, r: &RolloutRobot) -> bool {
     view.duty(&r.robot_id) == Duty::InWork
 }
 
 /// Robots of one wave.
 pub fn robots_of_wave<'a>(
-    view: &'a View,
+    view: &'a RolloutProjection,
     id: &RolloutId,
     wave: u32,
 ) -> impl Iterator<Item = &'a RolloutRobot> + use<'a> {
@@ -256,7 +256,7 @@ pub fn robots_of_wave<'a>(
 
 /// What the gate after a wave says. What would go on waits for a person where its robots' work costs more than its spec
 /// lets pass.
-pub fn judge_wave(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Verdict {
+pub fn judge_wave(view: &RolloutProjection, board: &Board, now: &Now, rollout: &Rollout) -> Verdict {
     let rollout = &Rollout { efforts: effort::see_efforts(view, rollout), ..rollout.clone() };
     let verdict = judge(view, board, now, rollout);
     let goes_on =
@@ -267,7 +267,7 @@ pub fn judge_wave(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> V
     }
 }
 
-fn judge(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Verdict {
+fn judge(view: &RolloutProjection, board: &Board, now: &Now, rollout: &Rollout) -> Verdict {
     let seen = count_wave(view, board, now, rollout);
     let give = |outcome, code: Code| compose_verdict(rollout, &seen, outcome, code.into(), now.utc);
     if rollout.revert_of.is_some() {

@@ -5,11 +5,11 @@
 use crate::ids::{AreaId, RolloutId};
 use crate::rollout::decision::plan::Tx;
 use crate::rollout::projection::rows::{AreaBundle, Rollout, Step};
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use std::collections::BTreeMap;
 
 /// Robots that come get this roll-out's bundle somewhere.
-pub fn is_served(view: &View, id: &RolloutId) -> bool {
+pub fn is_served(view: &RolloutProjection, id: &RolloutId) -> bool {
     view.area_bundles.values().any(|a| a.row.rollouts.values().any(|r| r == id))
 }
 

@@ -10,7 +10,7 @@ use crate::reason::{Code, Reason};
 use crate::robot::Duty;
 use crate::rollout::projection::rows::{Act, Bundle, Quarantine, Rollout, RolloutRobot, Step};
 use crate::rollout::projection::spec::{RolloutSpec, Wave};
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// One robot that a roll-out would reach.
@@ -78,7 +78,13 @@ impl Matching {
 }
 
 /// Matches every robot that ever attached.
-pub fn match_robots(view: &View, board: &Board, id: &RolloutId, spec: &RolloutSpec, bundle: &Bundle) -> Matching {
+pub fn match_robots(
+    view: &RolloutProjection,
+    board: &Board,
+    id: &RolloutId,
+    spec: &RolloutSpec,
+    bundle: &Bundle,
+) -> Matching {
     let mut matching = Matching::default();
     let mut found = Vec::new();
     for robot_id in view.sessions.values().map(|s| &s.row.robot_id) {
@@ -124,7 +130,7 @@ pub fn match_robots(view: &View, board: &Board, id: &RolloutId, spec: &RolloutSp
 }
 
 /// What is alike about this robot; none: it never attached.
-pub fn stratum_of(view: &View, board: &Board, robot_id: &RobotId) -> Option<Stratum> {
+pub fn stratum_of(view: &RolloutProjection, board: &Board, robot_id: &RobotId) -> Option<Stratum> {
     let inventory = &view.sessions.get(robot_id.as_str())?.row.inventory;
     let here = board.get(robot_id).and_then(|live| view.area_of(live));
     let mut capabilities = inventory.capabilities.clone();
@@ -137,13 +143,13 @@ pub fn stratum_of(view: &View, board: &Board, robot_id: &RobotId) -> Option<Stra
     })
 }
 
-fn label_of<'a>(view: &'a View, robot_id: &RobotId, key: &str) -> Option<&'a str> {
+fn label_of<'a>(view: &'a RolloutProjection, robot_id: &RobotId, key: &str) -> Option<&'a str> {
     let control = view.control.get(robot_id.as_str()).map(|c| &c.row);
     RobotControl::label(control, &view.sessions.get(robot_id.as_str())?.row.inventory, key)
 }
 
 /// Whether a roll-out is for a robot, as far as its selector goes.
-pub fn is_selected(view: &View, robot_id: &RobotId, stratum: &Stratum, spec: &RolloutSpec) -> bool {
+pub fn is_selected(view: &RolloutProjection, robot_id: &RobotId, stratum: &Stratum, spec: &RolloutSpec) -> bool {
     fn any<T: Ord>(named: &BTreeSet<T>, has: Option<&T>) -> bool {
         named.is_empty() || has.is_some_and(|has| named.contains(has))
     }
@@ -157,7 +163,7 @@ pub fn is_selected(view: &View, robot_id: &RobotId, stratum: &Stratum, spec: &Ro
 
 /// Whether a roll-out would have reached this robot had it been there: it is selected, and some wave takes all that are
 /// like it.
-pub fn is_meant_for(view: &View, robot_id: &RobotId, stratum: &Stratum, spec: &RolloutSpec) -> bool {
+pub fn is_meant_for(view: &RolloutProjection, robot_id: &RobotId, stratum: &Stratum, spec: &RolloutSpec) -> bool {
     let takes = |wave: &Wave| match wave {
         Wave::Rest | Wave::Percent(100..) => true,
         Wave::Label { key, value } => label_of(view, robot_id, key) == Some(value.as_str()),
@@ -174,7 +180,7 @@ pub fn pin_reason(pin: &Act) -> Reason {
 
 /// Its machine shows another device key than the one that is known, and nobody enrolled or took it: it is given
 /// nothing.
-pub fn other_key(view: &View, robot_id: &RobotId) -> Option<Reason> {
+pub fn other_key(view: &RolloutProjection, robot_id: &RobotId) -> Option<Reason> {
     let key = view.sessions.get(robot_id.as_str())?.row.other_device_key.as_ref()?;
     let accepted = view.software.get(robot_id.as_str()).and_then(|s| s.row.device_key.as_ref());
     if accepted == Some(key) {
@@ -187,7 +193,7 @@ pub fn other_key(view: &View, robot_id: &RobotId) -> Option<Reason> {
 pub type Members = (Vec<(RobotId, u32, u64, String)>, Vec<u32>);
 
 /// Whom a roll-out reaches.
-pub fn find_members(view: &View, board: &Board, rollout: &Rollout) -> Members {
+pub fn find_members(view: &RolloutProjection, board: &Board, rollout: &Rollout) -> Members {
     if let Some(original) = rollout.revert_of.as_ref().and_then(|of| view.rollout(of)) {
         let kept = view.robots_of(&original.rollout_id).filter(|r| is_kept(view, original, r));
         let member = |r: &RolloutRobot| {
@@ -208,14 +214,19 @@ pub fn find_members(view: &View, board: &Board, rollout: &Rollout) -> Members {
 
 /// A robot keeps what the roll-out brought, or is about to: a roll-out is completed before the last of its robots has
 /// said so.
-pub fn is_kept(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
+pub fn is_kept(view: &RolloutProjection, rollout: &Rollout, r: &RolloutRobot) -> bool {
     let software = view.software.get(r.robot_id.as_str()).map(|s| &s.row);
     let kept = matches!(r.step, Step::Trial | Step::Committing | Step::Committed);
     kept && software.and_then(|s| s.runs()) == Some(&rollout.spec.bundle)
 }
 
 /// Whether a robot may have a bundle at all.
-pub fn may_have(view: &View, robot_id: &RobotId, stratum: &Stratum, bundle: &Bundle) -> Result<(), Reason> {
+pub fn may_have(
+    view: &RolloutProjection,
+    robot_id: &RobotId,
+    stratum: &Stratum,
+    bundle: &Bundle,
+) -> Result<(), Reason> {
     if view.duty(robot_id) == Duty::Retired {
         return Err(Code::SkippedRetired.into());
     }
@@ -250,7 +261,7 @@ pub fn place_of(rollout: &RolloutId, robot: &RobotId) -> u64 {
 }
 
 /// The roll-out that has this robot now, other than `than`.
-pub fn claimed_by<'a>(view: &'a View, robot_id: &RobotId, than: &RolloutId) -> Option<&'a RolloutId> {
+pub fn claimed_by<'a>(view: &'a RolloutProjection, robot_id: &RobotId, than: &RolloutId) -> Option<&'a RolloutId> {
     let others = view.of_robot.get(robot_id)?.iter().filter(|id| *id != than);
     others.into_iter().find(|id| {
         let (Some(rollout), Some(robot)) = (view.rollout(id), view.robot_of(id, robot_id)) else { return false };

@@ -10,10 +10,10 @@ use crate::reason::{Code, Reason};
 use crate::rollout::decision::plan::{Tx, incident};
 use crate::rollout::projection::queue::{is_newcomer, is_retried};
 use crate::rollout::projection::rows::{Phase, Rollout, RolloutRobot, Step};
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 
 /// The completed roll-out that a robot should have had a part in, if there is one.
-pub fn find_rollout(view: &View, board: &Board, robot_id: &RobotId) -> Option<Rollout> {
+pub fn find_rollout(view: &RolloutProjection, board: &Board, robot_id: &RobotId) -> Option<Rollout> {
     let stratum = matching::stratum_of(view, board, robot_id)?;
     let area = view.area_bundles.get(stratum.area.as_ref()?.as_str())?;
     let rollout = view.rollout(area.row.rollouts.get(&stratum.model)?)?;

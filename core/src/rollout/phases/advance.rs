@@ -16,7 +16,7 @@ use crate::rollout::members::{assign, matching};
 use crate::rollout::projection::queue::{is_newcomer, is_retried};
 use crate::rollout::projection::rows::{Bundle, Countdown, Outcome, Phase, Rollout, RolloutRobot, Step, Verdict};
 use crate::rollout::projection::spec::AbortScope;
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use crate::rollout::projection::timestamp::Stamp;
 use crate::rollout::robots::due::is_irreversible;
 use crate::rollout::robots::moves;
@@ -94,12 +94,12 @@ pub fn abort(
     }
 }
 
-fn is_offline(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
+fn is_offline(view: &RolloutProjection, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
     !view.is_heard(board, now, &r.robot_id)
 }
 
 /// It is not heard, or shows another key than its own: it goes back once it comes, or once a person has taken that key.
-fn is_out_of_reach(view: &View, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
+fn is_out_of_reach(view: &RolloutProjection, board: &Board, now: &Now, r: &RolloutRobot) -> bool {
     is_offline(view, board, now, r) || matching::other_key(view, &r.robot_id).is_some()
 }
 
@@ -183,7 +183,7 @@ fn applying(tx: &mut Tx, board: &Board, rollout: Rollout) {
 }
 
 /// The next robots of later waves, for those of this wave that were skipped and for whom nobody stood in yet.
-fn find_stand_ins(view: &View, board: &Board, now: &Now, rollout: &Rollout) -> Vec<RolloutRobot> {
+fn find_stand_ins(view: &RolloutProjection, board: &Board, now: &Now, rollout: &Rollout) -> Vec<RolloutRobot> {
     let id = &rollout.rollout_id;
     let planned = rollout.sizes.get(rollout.wave as usize).copied().unwrap_or_default();
     let there = verdict::robots_of_wave(view, id, rollout.wave).filter(|r| r.step != Step::Skipped).count() as u32;

@@ -1,13 +1,13 @@
-//! What the picture holds of roll-outs that have ended: what is still named, and what was just asked for. Everything
+//! What the projection holds of roll-outs that have ended: what is still named, and what was just asked for. Everything
 //! else stays in the store.
 //!
 //! Called by the rollout service, which reads what is wanted and tells it. Invariant: whoever decides about a roll-out
 //! has it here whole, or it is not there: the service asks before.
 
 use super::rows::{AreaBundle, Phase, Rollout, RolloutRobot, Step};
-use super::state::View;
+use super::state::RolloutProjection;
 use crate::ids::RolloutId;
-use crate::picture::Viewed;
+use crate::projection::Projected;
 use crate::rows::{BadRow, Entry, Key, Part, Record, Revision, Row, Table};
 use std::collections::BTreeSet;
 
@@ -36,12 +36,12 @@ pub fn naming() -> Vec<Part> {
     ]
 }
 
-/// What the picture begins with. [`named`] says what is read with it.
+/// What the projection begins with. [`named`] says what is read with it.
 pub fn alive() -> Vec<Part> {
-    View::WHOLE.iter().map(|table| Part::Whole(*table)).chain(naming()).chain([robots()]).collect()
+    RolloutProjection::WHOLE.iter().map(|table| Part::Whole(*table)).chain(naming()).chain([robots()]).collect()
 }
 
-/// What rows of the picture name: the roll-out of a robot for which something is due, the one that another takes back,
+/// What rows of the projection name: the roll-out of a robot for which something is due, the one that another takes back,
 /// and those whose bundle newcomers get.
 pub fn named(rows: &[Row]) -> Vec<Key> {
     let mut keys = Vec::new();
@@ -70,7 +70,7 @@ fn is_open(rollout: &Rollout) -> bool {
 
 /// Whether the entry is of a roll-out that is not here; then it is read whole before anything is decided, unless the
 /// entry makes it or takes it away.
-pub(in crate::rollout) fn is_elsewhere(view: &mut View, entry: &Entry, table: Table) -> bool {
+pub(in crate::rollout) fn is_elsewhere(view: &mut RolloutProjection, entry: &Entry, table: Table) -> bool {
     let id = match table {
         Table::Rollout if entry.revision > Revision(1) => &*entry.subject,
         Table::RolloutRobot => entry.subject.split_once('/').map_or("", |(rollout, _)| rollout),
@@ -86,8 +86,8 @@ pub(in crate::rollout) fn is_elsewhere(view: &mut View, entry: &Entry, table: Ta
     true
 }
 
-impl View {
-    /// Roll-outs that something in the picture names, and those that have not ended.
+impl RolloutProjection {
+    /// Roll-outs that something in the projection names, and those that have not ended.
     fn needed(&self) -> BTreeSet<RolloutId> {
         let open = self.rollouts.values().map(|r| &r.row).filter(|r| is_open(r));
         let mut needed: BTreeSet<RolloutId> =
@@ -126,7 +126,7 @@ impl View {
         Ok(())
     }
     /// Lets go of roll-outs that have ended and that nothing names, and of used request_ids. To be called once the
-    /// picture has absorbed all that was committed by it.
+    /// projection has absorbed all that was committed by it.
     pub fn let_go(&mut self) {
         let needed = self.needed();
         let ended = self.rollouts.values().map(|r| &r.row.rollout_id).filter(|id| !needed.contains(*id));

@@ -4,14 +4,14 @@
 
 use super::queue::waits_out;
 use super::rows::{AreaBundle, Quarantine, RobotSoftware, RolloutRobot};
-use super::state::View;
+use super::state::RolloutProjection;
 use crate::fleet::rows::RobotControl;
 use crate::ids::{RobotId, RolloutId};
-use crate::picture::Indexed;
+use crate::projection::Indexed;
 use crate::work::Session;
 use std::collections::BTreeMap;
 
-impl Indexed<RolloutRobot> for View {
+impl Indexed<RolloutRobot> for RolloutProjection {
     fn changed(view: &mut Self, id: &str, old: Option<&RolloutRobot>) {
         let new = view.robots.get(id).map(|r| &r.row);
         let size = |sizes: &mut BTreeMap<(RolloutId, u32), u32>, row: &RolloutRobot, by: i32| {
@@ -55,7 +55,7 @@ impl Indexed<RolloutRobot> for View {
     }
 }
 
-impl Indexed<RobotSoftware> for View {
+impl Indexed<RobotSoftware> for RolloutProjection {
     fn changed(view: &mut Self, id: &str, old: Option<&RobotSoftware>) {
         let Some(new) = view.software.get(id).map(|s| &s.row) else { return };
         if old.is_none_or(|old| old.area != new.area || old.pin.is_some() != new.pin.is_some()) {
@@ -64,7 +64,7 @@ impl Indexed<RobotSoftware> for View {
     }
 }
 
-impl Indexed<RobotControl> for View {
+impl Indexed<RobotControl> for RolloutProjection {
     fn changed(view: &mut Self, id: &str, old: Option<&RobotControl>) {
         let Some(new) = view.control.get(id).map(|c| &c.row) else { return };
         if old.is_some_and(|old| old.retired.is_some()) && new.retired.is_none() {
@@ -73,7 +73,7 @@ impl Indexed<RobotControl> for View {
     }
 }
 
-impl Indexed<Quarantine> for View {
+impl Indexed<Quarantine> for RolloutProjection {
     fn changed(view: &mut Self, id: &str, old: Option<&Quarantine>) {
         if let Some(lifted) = old.filter(|_| !view.quarantines.contains_key(id)) {
             view.arrived.insert(lifted.robot_id.clone());
@@ -81,7 +81,7 @@ impl Indexed<Quarantine> for View {
     }
 }
 
-impl Indexed<AreaBundle> for View {
+impl Indexed<AreaBundle> for RolloutProjection {
     /// Robots that came while the roll-out ran had no part in it.
     fn changed(view: &mut Self, _id: &str, _old: Option<&AreaBundle>) {
         let all: Vec<RobotId> = view.sessions.values().map(|s| s.row.robot_id.clone()).collect();
@@ -89,7 +89,7 @@ impl Indexed<AreaBundle> for View {
     }
 }
 
-impl Indexed<Session> for View {
+impl Indexed<Session> for RolloutProjection {
     fn changed(view: &mut Self, id: &str, _old: Option<&Session>) {
         view.arrived.extend(view.sessions.get(id).map(|s| s.row.robot_id.clone()));
     }

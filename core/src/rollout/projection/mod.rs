@@ -15,5 +15,5 @@ pub mod spec;
 pub mod state;
 pub mod timestamp;
 
-pub use crate::picture::{Rowed, Slot};
-pub use state::View;
+pub use crate::projection::{Rowed, Slot};
+pub use state::RolloutProjection;

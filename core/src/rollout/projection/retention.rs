@@ -4,7 +4,7 @@
 //! lists needs no name here.
 
 use super::rows::{RobotSoftware, Rollout};
-use super::state::View;
+use super::state::RolloutProjection;
 use crate::ids::BundleId;
 use crate::limits;
 use crate::time::{Now, Utc};
@@ -14,7 +14,7 @@ use std::collections::BTreeSet;
 const DAY_MS: u64 = 24 * 3_600_000;
 
 /// Bundles that a roll-out, one that ended not long ago, a rule for newcomers or a robot names.
-pub fn needed_bundles(view: &View, now: &Now) -> BTreeSet<BundleId> {
+pub fn needed_bundles(view: &RolloutProjection, now: &Now) -> BTreeSet<BundleId> {
     let rollouts = view.rollouts.values().map(|r| &r.row).filter(|r| needs_bundle(view, r));
     let served = view.area_bundles.values().flat_map(|a| a.row.rollouts.values()).filter_map(|id| view.rollout(id));
     let mut named: BTreeSet<BundleId> = rollouts.chain(served).map(|r| r.spec.bundle.clone()).collect();
@@ -32,6 +32,6 @@ pub fn needed_bundles(view: &View, now: &Now) -> BTreeSet<BundleId> {
 }
 
 /// It is open, or something is still due for one of its robots.
-fn needs_bundle(view: &View, rollout: &Rollout) -> bool {
+fn needs_bundle(view: &RolloutProjection, rollout: &Rollout) -> bool {
     !rollout.phase.is_over() || view.robots_of(&rollout.rollout_id).any(|r| !r.step.is_over())
 }

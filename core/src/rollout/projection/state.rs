@@ -1,8 +1,8 @@
-//! The rollout service's picture of the rows: built from a snapshot, kept by the feed, and already holding what it is
+//! The rollout service's projection of the rows: built from a snapshot, kept by the feed, and already holding what it is
 //! about to commit.
 //!
 //! Called by every room of `rollout`. Invariants:
-//! 1. As [`crate::picture`] says; after a conflict the whole view is built again, never patched.
+//! 1. As [`crate::projection`] says; after a conflict the whole view is built again, never patched.
 //! 2. A roll-out is here with all its robots, or not at all. Of those that have ended only what is still named is here
 //!    ([`ended`](super::ended)), and used request_ids are those that were just asked for.
 
@@ -15,8 +15,8 @@ use crate::fleet::rows::{AreaBudget, Drain, RobotAuthority, RobotControl, RobotC
 use crate::ids::{AreaId, DrainId, RobotId, RolloutId};
 use crate::limits;
 use crate::maintenance::{DrainRelease, DrainRequest};
-use crate::picture::{Indexed, picture};
 use crate::policy::AreaPolicy;
+use crate::projection::{Indexed, projection};
 use crate::reason::Code;
 use crate::robot::{Duty, Lane, Presence};
 use crate::rollout::bugs::Bugs;
@@ -29,9 +29,9 @@ use crate::work::{LaneMark, Live, Session};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-picture! {
+projection! {
     /// What the rollout service knows.
-    pub struct View of Ota;
+    pub struct RolloutProjection of Ota;
     new(site: Arc<Site>, started: Now, read: Now);
     whole {
         /// Bundles of releases.
@@ -105,7 +105,7 @@ picture! {
         /// Last entry of the robot inbox that changed nothing. It must not be taken again once something else was
         /// decided. Volatile.
         passed: Seq = Seq(0);
-        /// Rows were read at this entry: what older entries say of rows is in the picture already.
+        /// Rows were read at this entry: what older entries say of rows is in the projection already.
         read_at: Seq = Seq(0);
         /// Reading of the clocks when the service started: everybody counts as heard then.
         started: Now = started;
@@ -132,7 +132,7 @@ pub struct Contact {
     pub last: LinkTime,
 }
 
-impl View {
+impl RolloutProjection {
     /// Takes every row of a snapshot read at `seq`.
     ///
     /// # Errors

@@ -22,14 +22,14 @@ use crate::rollout::members::{area_bundles, matching};
 use crate::rollout::projection::queue::{is_directive_old, is_late, is_newcomer, is_on, is_retried, waits_out};
 use crate::rollout::projection::rows::{Given, Pause, Phase, Rollout, RolloutRobot, Step};
 use crate::rollout::projection::spec::AbortScope;
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use crate::time::Now;
 use crate::update::{Goal, UpdateReport, UpdateState};
 
 /// One robot in one roll-out, with all that decides what is due for it.
 #[derive(Clone, Copy)]
 struct Situation<'a> {
-    view: &'a View,
+    view: &'a RolloutProjection,
     board: &'a Board,
     now: &'a Now,
     rollout: &'a Rollout,
@@ -39,7 +39,13 @@ struct Situation<'a> {
 }
 
 /// What is due for `r` now, if anything.
-pub fn find_move(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Move> {
+pub fn find_move(
+    view: &RolloutProjection,
+    board: &Board,
+    now: &Now,
+    rollout: &Rollout,
+    r: &RolloutRobot,
+) -> Option<Move> {
     if view.duty(&r.robot_id) == Duty::Retired && !r.step.is_over() {
         return Some(Move::Skip(Code::SkippedRetired.into()));
     }
@@ -73,7 +79,13 @@ pub fn find_move(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &R
 }
 
 /// Why a robot that has the bundle is not taken out of work now.
-pub fn blocked(view: &View, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> Option<Reason> {
+pub fn blocked(
+    view: &RolloutProjection,
+    board: &Board,
+    now: &Now,
+    rollout: &Rollout,
+    r: &RolloutRobot,
+) -> Option<Reason> {
     Situation { view, board, now, rollout, r, report: None }.blocked()
 }
 
@@ -477,24 +489,24 @@ fn ended(r: &RolloutRobot, report: Option<&UpdateReport>) -> Option<Move> {
 }
 
 /// Nobody may be given its bundle any more: a person took it back, or no release lists it.
-pub fn is_gone(view: &View, rollout: &Rollout) -> bool {
+pub fn is_gone(view: &RolloutProjection, rollout: &Rollout) -> bool {
     let bundle = view.bundles.get(rollout.spec.bundle.as_str()).map(|b| &b.row);
     rollout.revert_of.is_none() && bundle.is_none_or(|b| b.revoked.is_some() || !b.listed)
 }
 
 /// What was told to be kept cannot be gone back from.
-pub fn is_irreversible(view: &View, rollout: &Rollout) -> bool {
+pub fn is_irreversible(view: &RolloutProjection, rollout: &Rollout) -> bool {
     view.bundles.get(rollout.spec.bundle.as_str()).is_some_and(|b| b.row.is_irreversible)
 }
 
 /// Nobody can sign what its robots take, whatever its phase: newcomers of one that is completed wait too. Who goes back
 /// was told already with what it goes back from.
-pub fn is_keyless(view: &View, rollout: &Rollout) -> bool {
+pub fn is_keyless(view: &RolloutProjection, rollout: &Rollout) -> bool {
     view.keyless.is_some() && rollout.revert_of.is_none()
 }
 
 /// Robots that may be out of work for a roll-out at once: never more than its wave has.
-pub fn in_flight_max(view: &View, rollout: &Rollout) -> u32 {
+pub fn in_flight_max(view: &RolloutProjection, rollout: &Rollout) -> u32 {
     if view.bugs.in_flight_is_forgotten() {
         return u32::MAX;
     }
@@ -507,20 +519,25 @@ pub fn in_flight_max(view: &View, rollout: &Rollout) -> u32 {
 
 /// The area whose rules hold for a robot that changes to something new: where it is, or was seen last. Who goes back
 /// asks no rules.
-pub(super) fn area_ahead(view: &View, board: &Board, rollout: &Rollout, r: &RolloutRobot) -> Option<AreaId> {
+pub(super) fn area_ahead(
+    view: &RolloutProjection,
+    board: &Board,
+    rollout: &Rollout,
+    r: &RolloutRobot,
+) -> Option<AreaId> {
     let here = || board.get(&r.robot_id).and_then(|live| view.area_of(live));
     let seen = || view.software.get(r.robot_id.as_str()).and_then(|s| s.row.area.clone());
     if rollout.revert_of.is_some() { None } else { here().or_else(seen) }
 }
 
 /// Fleet was asked to take it out of work, and its drain has not begun.
-pub(super) fn is_asked(view: &View, r: &RolloutRobot) -> bool {
+pub(super) fn is_asked(view: &RolloutProjection, r: &RolloutRobot) -> bool {
     let waits = |id| view.drain(id).is_none_or(|drain| drain.state == DrainState::Waiting);
     r.step == Step::Draining && r.drain_id.as_ref().is_some_and(waits)
 }
 
 /// The heartbeat of the newest session to which a permission is anchored; none: there is none.
-pub(super) fn anchor(view: &View, board: &Board, robot_id: &RobotId) -> Option<Authority> {
+pub(super) fn anchor(view: &RolloutProjection, board: &Board, robot_id: &RobotId) -> Option<Authority> {
     let live = board.get(robot_id)?;
     let session = view.sessions.get(robot_id.as_str())?;
     let (session_epoch, hb) = (live.report.session_epoch, live.report.hb);
@@ -529,6 +546,6 @@ pub(super) fn anchor(view: &View, board: &Board, robot_id: &RobotId) -> Option<A
 }
 
 /// Whether the robot was told so already.
-pub(super) fn wants(view: &View, r: &RolloutRobot, goal: Goal) -> bool {
+pub(super) fn wants(view: &RolloutProjection, r: &RolloutRobot, goal: Goal) -> bool {
     view.desired.get(r.robot_id.as_str()).is_some_and(|d| d.row.goal == goal)
 }

@@ -26,7 +26,7 @@ use crate::rollout::projection::queue::{is_directive_old, is_retried};
 use crate::rollout::projection::rows::{
     Act, Given, Lost, OtaClock, RobotSoftware, Rollout, RolloutRobot, Step, WayBack,
 };
-use crate::rollout::projection::state::View;
+use crate::rollout::projection::state::RolloutProjection;
 use crate::rollout::projection::timestamp::Stamp;
 use crate::time::Now;
 use crate::update::{ActivationGrant, DesiredUpdate, Goal};
@@ -172,13 +172,13 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
 }
 
 /// Why nothing is signed for `r` now: nobody can, or its machine is not known to be the robot's. None: it is.
-pub fn why_unsigned(view: &View, r: &RolloutRobot) -> Option<Reason> {
+pub fn why_unsigned(view: &RolloutProjection, r: &RolloutRobot) -> Option<Reason> {
     view.keyless.map(Reason::from).or_else(|| other_key(view, &r.robot_id))
 }
 
 /// Whether what is due for `r` is told with a directive that must be signed for that, or takes it out of work only for
 /// one.
-pub fn is_signed(view: &View, rollout: &Rollout, r: &RolloutRobot, due: &Move) -> bool {
+pub fn is_signed(view: &RolloutProjection, rollout: &Rollout, r: &RolloutRobot, due: &Move) -> bool {
     match due {
         Move::Stage | Move::SignAnew | Move::OrderBackAnew => true,
         Move::GoBack => must_be_ordered_back(view, rollout, r),
@@ -193,7 +193,7 @@ pub fn is_signed(view: &View, rollout: &Rollout, r: &RolloutRobot, due: &Move) -
 
 /// It was told something else since, and has left it, or it was stuck: only a directive of its own leads back from what
 /// it kept.
-fn must_be_ordered_back(view: &View, rollout: &Rollout, r: &RolloutRobot) -> bool {
+fn must_be_ordered_back(view: &RolloutProjection, rollout: &Rollout, r: &RolloutRobot) -> bool {
     let said = view.software_of(&r.robot_id).report.map(|report| report.bundle);
     let left = rollout.revert_of.is_some() && said.as_ref() != Some(&rollout.spec.bundle);
     left || r.way_back.unstuck || !view.desired.contains_key(r.robot_id.as_str())
@@ -310,7 +310,7 @@ fn order_back(tx: &mut Tx, sign: &dyn Sign, rollout: &Rollout, r: &mut RolloutRo
     r.way_back = WayBack { generation, signed: Some(tx.now.wall), refused: None, again, ..r.way_back };
 }
 
-fn next_generation(view: &View, robot_id: &RobotId, now: &Now) -> u64 {
+fn next_generation(view: &RolloutProjection, robot_id: &RobotId, now: &Now) -> u64 {
     let last = view.desired.get(robot_id.as_str()).map_or(0, |d| d.row.generation);
     let reported = view.sessions.get(robot_id.as_str()).map_or(0, |s| s.row.followed_update());
     (last.max(reported) + 1).max(now.wall.0.max(0) as u64)
@@ -345,7 +345,7 @@ fn next_number(tx: &mut Tx, used: u64) -> u64 {
 /// The highest permission that a robot says it has used. After a jump of the clock it may lie ahead of everything that
 /// a store of before knows; what lies further ahead than a clock jumps is not followed: so far the word of one robot
 /// moves the numbers of all.
-fn used_grant(view: &View, board: &Board, now: &Now, robot_id: &RobotId) -> u64 {
+fn used_grant(view: &RolloutProjection, board: &Board, now: &Now, robot_id: &RobotId) -> u64 {
     let said = board.get(robot_id).and_then(|live| live.report.update.as_ref());
     let known = view.software.get(robot_id.as_str()).and_then(|s| s.row.report.as_ref());
     let used = said.into_iter().chain(known).map(|report| report.grant_id).max().unwrap_or_default();

@@ -1,4 +1,4 @@
-//! What the picture holds of roll-outs that have ended.
+//! What the projection holds of roll-outs that have ended.
 
 use super::*;
 use crate::rollout::projection::ended;
@@ -18,10 +18,10 @@ fn wanted(rig: &Rig) -> Vec<RolloutId> {
     rig.ota.wanted().into_iter().collect()
 }
 
-/// A roll-out of which nothing is left to do, and a picture that has let go of it.
+/// A roll-out of which nothing is left to do, and a projection that has let go of it.
 fn let_go() -> Rig {
     let mut rig = Rig::new(4);
-    // The rows hold more than the picture does.
+    // The rows hold more than the projection does.
     rig.checks_rebuild = false;
     rig.start(spec());
     rig.must("ro", Verb::Abort);

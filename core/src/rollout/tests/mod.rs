@@ -1,7 +1,7 @@
 //! Roll-outs over rows in memory: the real planner of roll-outs, fleet's real drains and budgets, and robots that obey
 //! their section `update` as agents do, one second at a time.
 //!
-//! Invariant: every item finds its rows as it expects them, and after each turn a picture built from the rows equals
+//! Invariant: every item finds its rows as it expects them, and after each turn a projection built from the rows equals
 //! the one that was kept.
 
 mod aborts;
@@ -49,7 +49,7 @@ use crate::rollout::projection::rows::{
     AreaBundle, Bundle, Outcome, Phase, RobotSoftware, Rollout, RolloutRobot, Step,
 };
 use crate::rollout::projection::spec::{RolloutSpec, Wave};
-use crate::rollout::projection::{Slot, View};
+use crate::rollout::projection::{RolloutProjection, Slot};
 use crate::rollout::robots::{due, machine};
 use crate::rollout::{absorb, cycle};
 use crate::rows::{Entry, Expect, Item, Key, Log, Record, Revision, Row, Seq, Table, Write};
@@ -151,9 +151,9 @@ struct Rig {
     seq: u64,
     rows: BTreeMap<Key, Row>,
     feed: Vec<Entry>,
-    ota: View,
+    ota: RolloutProjection,
     ota_at: usize,
-    fleet: fleet::projection::View,
+    fleet: fleet::projection::FleetProjection,
     fleet_at: usize,
     board: Board,
     heard: BTreeSet<RobotId>,
@@ -179,9 +179,9 @@ impl Rig {
             seq: 0,
             rows: BTreeMap::new(),
             feed: Vec::new(),
-            ota: View::new(site.clone(), now, now),
+            ota: RolloutProjection::new(site.clone(), now, now),
             ota_at: 0,
-            fleet: fleet::projection::View::new(site, now, now),
+            fleet: fleet::projection::FleetProjection::new(site, now, now),
             fleet_at: 0,
             board: Board::new(),
             heard: BTreeSet::new(),
@@ -439,7 +439,7 @@ impl Rig {
         for entry in &entries {
             let Some(table) = entry.table else { continue };
             let key = Key { table, id: entry.subject.clone() };
-            let row = crate::picture::row_of(entry, table);
+            let row = crate::projection::row_of(entry, table);
             self.fleet.absorb(&key, entry.revision, row.as_ref()).expect("a row");
         }
         drain::obey(&mut self.fleet, self.now, &mut plan);
@@ -458,10 +458,11 @@ impl Rig {
         self.ota = fresh;
     }
 
-    fn rebuilt(&self) -> View {
-        let mut view = View::new(self.ota.site.clone(), self.ota.started, self.now);
+    fn rebuilt(&self) -> RolloutProjection {
+        let mut view = RolloutProjection::new(self.ota.site.clone(), self.ota.started, self.now);
         let is_read = |table| {
-            View::WHOLE.contains(&table) || matches!(table, Table::Rollout | Table::RolloutRobot | Table::OtaCommandKey)
+            RolloutProjection::WHOLE.contains(&table)
+                || matches!(table, Table::Rollout | Table::RolloutRobot | Table::OtaCommandKey)
         };
         let rows: Vec<Row> = self.rows.values().filter(|row| is_read(row.key.table)).cloned().collect();
         view.load(&rows, Seq(self.seq)).expect("rows read");
@@ -486,7 +487,8 @@ impl Rig {
         same(&old.drains, &fresh.drains);
         same(&old.authority, &fresh.authority);
         assert_eq!(old.open, fresh.open);
-        let sizes = |view: &View| view.wave_sizes.clone().into_iter().filter(|(_, n)| *n > 0).collect::<Vec<_>>();
+        let sizes =
+            |view: &RolloutProjection| view.wave_sizes.clone().into_iter().filter(|(_, n)| *n > 0).collect::<Vec<_>>();
         assert_eq!(sizes(old), sizes(&fresh));
     }
 
@@ -521,7 +523,7 @@ impl Rig {
 }
 
 fn same<R: PartialEq + std::fmt::Debug>(kept: &Slot<R>, fresh: &Slot<R>) {
-    assert_eq!(kept, fresh, "the picture that was kept, and one built anew");
+    assert_eq!(kept, fresh, "the projection that was kept, and one built anew");
 }
 
 fn fresh_report(state: UpdateState, bundle: &BundleId, directive: u64) -> UpdateReport {

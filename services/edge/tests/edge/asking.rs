@@ -182,7 +182,7 @@ async fn a_stop_finds_room_in_a_full_port_and_where_classes_are_alike_it_does_no
 async fn serves_again(bugs: Bugs) -> bool {
     let world = named(Config { requests_max: 10, bugs, ..Config::default() }).await;
     let mut flood = world.client().await;
-    // Often enough for seats that are not given back to be used up.
+    // Often enough for slots that are not given back to be used up.
     for _ in 0..10 {
         let mut open = Vec::new();
         while let Some(head) = flood.held(FETCH).await {

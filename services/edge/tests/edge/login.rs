@@ -9,7 +9,7 @@ use midshift_core::reason::Code;
 use midshift_core::time::{Clock, LinkDuration, Utc};
 use midshift_core::wall::WallClock;
 use midshift_edge::tls::Clients;
-use midshift_edge::{Config, Denial, Denials, Known, robot_of};
+use midshift_edge::{Config, Denial, Denials, SitePrincipals, robot_of};
 use sha2::Digest as _;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -28,7 +28,7 @@ pub struct Port {
     stepped_ms: Arc<AtomicU64>,
     pub world: World,
     pub authority: Authority,
-    known: Arc<Known>,
+    known: Arc<SitePrincipals>,
     denials: mpsc::Receiver<Denial>,
     _tls: watch::Sender<Arc<rustls::ServerConfig>>,
 }
@@ -50,7 +50,7 @@ impl Port {
         let wall =
             move || Utc(BEGIN).plus_ms(beside.load(Ordering::Relaxed) / 1000).plus_ms(ahead.load(Ordering::Relaxed));
         let clock: Arc<dyn Clock> = Arc::new(WallClock::new(move || source.load(Ordering::Relaxed), wall, |_| {}));
-        let known = Arc::new(Known::new(site(), clock.clone()));
+        let known = Arc::new(SitePrincipals::new(site(), clock.clone()));
         let (tls, newest) = watch::channel(authority.server_by(Clients::Asked(vec![authority.root()]), &clock));
         let (tell, denials) = Denials::new("business");
         let world = World::telling(config, known.clone(), Some(newest), Some(tell)).await;
@@ -104,19 +104,19 @@ async fn a_robot_is_who_its_certificate_says_and_may_call_what_is_for_robots_alo
 #[tokio::test]
 async fn a_certificate_that_names_no_robot_of_this_site_is_not_let_in() {
     let port = Port::open().await;
-    let strangers = [
+    let refused = [
         port.authority.issue_uri("spiffe://elsewhere/robot/r7"),
         port.authority.issue_uri("spiffe://factory/server/r7"),
         port.authority.issue_uri("spiffe://factory/robot/"),
         port.authority.issue("r7"),
     ];
-    for stranger in &strangers {
-        if let Ok(stream) = port.authority.connect(&port.world, Some(stranger)).await {
+    for leaf in &refused {
+        if let Ok(stream) = port.authority.connect(&port.world, Some(leaf)).await {
             let refused = code(&mut Client::over(stream).await, HEALTH, None).await;
             assert_eq!(refused, Err(Code::KeyDenied), "it hears why");
         }
     }
-    port.world.closed_times("denied", strangers.len() as u64).await;
+    port.world.closed_times("denied", refused.len() as u64).await;
 }
 
 #[tokio::test]

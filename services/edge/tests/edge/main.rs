@@ -14,5 +14,5 @@ mod principals;
 mod proofs;
 mod readings;
 mod services;
-mod strangers;
+mod unauthenticated;
 mod world;

@@ -182,7 +182,7 @@ async fn a_standby_answers_what_the_leader_answers() {
     }
     w.until_phase("T0", Phase::Running).await;
     w.pass(2).await;
-    let slots = |view: &midshift_core::fleet::projection::View| {
+    let slots = |view: &midshift_core::fleet::projection::FleetProjection| {
         let ready: Vec<_> = view.queue.ready().collect();
         format!("{:?} {:?} {:?} {:?} {ready:?}", view.tasks, view.attempts, view.places, view.authority)
     };

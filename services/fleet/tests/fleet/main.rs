@@ -18,8 +18,8 @@ mod offers;
 #[path = "../../../../tests/src/old_site.rs"]
 mod old_site;
 mod people;
-mod picture;
 mod places;
+mod projection;
 mod races;
 mod reach;
 mod refused;

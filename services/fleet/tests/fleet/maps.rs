@@ -43,7 +43,7 @@ async fn a_map_that_is_forced_is_an_incident_of_each_thing_that_was_in_its_way()
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
     started_with(&mut w, MapChange::Forced { obstacles: obstacles() }).await;
-    // The picture is read anew after an outage: nobody is told again.
+    // The projection is read anew after an outage: nobody is told again.
     w.shaky.fail(true);
     w.r("r1").set_mode(Mode::Manual);
     w.pass(2).await;

@@ -96,11 +96,11 @@ async fn a_decision_that_was_put_aside_is_made_again_once_the_robot_comes_anew()
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_decision_that_the_store_refuses_is_taken_back_alone_and_no_picture_is_read_again() {
+async fn a_decision_that_the_store_refuses_is_taken_back_alone_and_no_projection_is_read_again() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r2", "park-b").await;
     w.pass(2).await;
-    let read = w.shaky.pictures_read();
+    let read = w.shaky.projections_read();
     w.shaky.refuse(Some(Table::DesiredPolicy));
     w.robot("r1", "park-a").await;
     w.submit("T1", "B", "A").await;
@@ -110,7 +110,7 @@ async fn a_decision_that_the_store_refuses_is_taken_back_alone_and_no_picture_is
     w.until("its deadline cannot be written", |s| !s.open_incidents("DECISION_PUT_ASIDE").is_empty()).await;
     w.shaky.refuse(None);
     assert!(w.shaky.refused() >= 2, "the store refused {} items", w.shaky.refused());
-    assert_eq!(w.shaky.pictures_read(), read, "no picture was built anew");
+    assert_eq!(w.shaky.projections_read(), read, "no projection was built anew");
     w.lawful().await;
 }
 
@@ -121,13 +121,13 @@ async fn an_event_that_cannot_be_obeyed_is_passed_over_and_those_after_it_are_ob
     w.robot("r2", "park-b").await;
     w.submit_with("T1", "A", "B", |raw| raw.robot_id = "r1".to_owned()).await;
     w.until_phase("T1", Phase::Running).await;
-    let read = w.shaky.pictures_read();
+    let read = w.shaky.projections_read();
     w.shaky.refuse(Some(Table::RobotCounter));
     w.until("its end is passed over", |s| !s.open_incidents("ENTRY_PASSED_OVER").is_empty()).await;
     w.shaky.refuse(None);
     w.submit_with("T2", "B", "A", |raw| raw.robot_id = "r2".to_owned()).await;
     w.until_phase("T2", Phase::Succeeded).await;
-    assert_eq!(w.shaky.pictures_read(), read, "no picture was built anew");
+    assert_eq!(w.shaky.projections_read(), read, "no projection was built anew");
     w.lawful().await;
 }
 

@@ -258,7 +258,7 @@ async fn questions_are_answered_though_the_store_takes_nothing() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn what_lasts_is_told_though_the_picture_is_read_anew_again_and_again() {
+async fn what_lasts_is_told_though_the_projection_is_read_anew_again_and_again() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
     for _ in 0..8 {

@@ -1,7 +1,7 @@
 //! Turns: questions and the plan wait for each other only so long, counted in questions and in decisions.
 
 use crate::harness::World;
-use midshift_core::fleet::projection::View;
+use midshift_core::fleet::projection::FleetProjection;
 use midshift_core::limits;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
@@ -64,7 +64,8 @@ async fn a_long_plan_lets_a_question_in_after_each_slice() {
     w.shaky.feed_for(TURN);
     // What each of them waits for can never be: each is a decision.
     w.cancel("first", false).await;
-    let asked = |view: &View| view.tasks.values().filter(|task| task.row.phase == Phase::NeedsOperator).count();
+    let asked =
+        |view: &FleetProjection| view.tasks.values().filter(|task| task.row.phase == Phase::NeedsOperator).count();
     let (mut last, mut answers) = (0, 0);
     while last < tasks {
         let now = w.fleet.look(move |view, _, _| asked(view)).await.expect("an answer");

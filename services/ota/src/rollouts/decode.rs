@@ -3,7 +3,7 @@
 use midshift_core::gates::EffortLimits;
 use midshift_core::ids::{AreaId, BundleId, RobotId};
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
-use midshift_core::rollout::projection::View;
+use midshift_core::rollout::projection::RolloutProjection;
 use midshift_core::rollout::spec::{RolloutSpec, Selector, Wave};
 use midshift_proto::convert::{At, WireEnum, parse_ms};
 use midshift_proto::ota::v1;
@@ -14,7 +14,7 @@ use prost_types::Duration;
 ///
 /// # Errors
 /// None is called so.
-pub fn bundle(view: &View, text: &str) -> Result<BundleId, Refusal> {
+pub fn bundle(view: &RolloutProjection, text: &str) -> Result<BundleId, Refusal> {
     if let Ok(id) = BundleId::parse(text)
         && view.bundles.contains_key(id.as_str())
     {

@@ -4,7 +4,7 @@ use midshift_core::gates::{Effort, EffortLimits, Suspicion, TaskTally};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::dry_run::DryRun;
 use midshift_core::rollout::explain::blocked;
-use midshift_core::rollout::projection::View;
+use midshift_core::rollout::projection::RolloutProjection;
 use midshift_core::rollout::rows::{Abort, Act, Quarantine, RobotSoftware, Rollout, RolloutRobot, Step, Verdict};
 use midshift_core::rollout::spec::{RolloutSpec, Wave};
 use midshift_core::rollout::timestamp::Stamp;
@@ -28,7 +28,7 @@ fn act(act: &Act) -> v1::RolloutAct {
     v1::RolloutAct { actor: act.actor.clone(), reason: act.reason.clone(), time: Some(timestamp(act.at)) }
 }
 
-fn label(view: &View, bundle: &str) -> String {
+fn label(view: &RolloutProjection, bundle: &str) -> String {
     view.bundles.get(bundle).map(|b| b.row.label()).unwrap_or_default()
 }
 
@@ -175,15 +175,15 @@ fn count(counts: &mut v1::RolloutCounts, r: &RolloutRobot) {
     counts.attempted += u32::from(r.attempted);
 }
 
-/// A roll-out of the picture.
-pub fn rollout(view: &View, now: &Now, row: &Rollout) -> v1::Rollout {
+/// A roll-out of the projection.
+pub fn rollout(view: &RolloutProjection, now: &Now, row: &Rollout) -> v1::Rollout {
     let mut counts = Counts::default();
     view.robots_of(&row.rollout_id).for_each(|r| counts.add(r));
     counted(view, now, row, counts)
 }
 
 /// A roll-out whose robots were counted.
-pub fn counted(view: &View, now: &Now, row: &Rollout, counts: Counts) -> v1::Rollout {
+pub fn counted(view: &RolloutProjection, now: &Now, row: &Rollout, counts: Counts) -> v1::Rollout {
     let Counts { all, waves, skipped_by_reason } = counts;
     let served = view.served_ms(now);
     let left = |c: Option<midshift_core::rollout::rows::Countdown>| c.map(|c| duration(c.left(served)));
@@ -226,7 +226,7 @@ pub fn counted(view: &View, now: &Now, row: &Rollout, counts: Counts) -> v1::Rol
 }
 
 /// A robot in a roll-out, with what it waits for.
-pub fn robot(view: &View, board: &Board, now: &Now, row: &Rollout, r: &RolloutRobot) -> v1::RolloutRobot {
+pub fn robot(view: &RolloutProjection, board: &Board, now: &Now, row: &Rollout, r: &RolloutRobot) -> v1::RolloutRobot {
     let waits = blocked(view, board, now, row, r);
     let m = &r.moments;
     let span = |from: Option<Utc>, to: Option<Utc>| from.zip(to).map(|(from, to)| duration(to.ms_since(from)));
@@ -311,7 +311,7 @@ pub fn software(row: &RobotSoftware) -> v1::RobotSoftware {
 }
 
 /// A bundle that a robot went back from.
-pub fn quarantine(view: &View, row: &Quarantine) -> v1::Quarantine {
+pub fn quarantine(view: &RolloutProjection, row: &Quarantine) -> v1::Quarantine {
     v1::Quarantine {
         robot_id: row.robot_id.to_string(),
         bundle: row.bundle.to_string(),

@@ -1,5 +1,5 @@
 //! Roll-outs that have ended, and used request_ids: read from the store when somebody asks for them, or when the
-//! picture names them.
+//! projection names them.
 //!
 //! Invariant: a roll-out is read with all its robots, at one moment.
 
@@ -13,13 +13,13 @@ use std::collections::BTreeSet;
 
 /// What is to be read.
 pub(super) struct Wanted {
-    /// Roll-outs that the picture names.
+    /// Roll-outs that the projection names.
     named: BTreeSet<RolloutId>,
     keys: Vec<Key>,
 }
 
 impl Loop {
-    /// What the picture, `requests` and open questions want to know and is not in the picture.
+    /// What the projection, `requests` and open questions want to know and is not in the projection.
     pub(super) fn wanted(&self, requests: &[Request]) -> Wanted {
         let named = self.view.wanted();
         let mut ids: BTreeSet<RolloutId> =
@@ -38,7 +38,7 @@ impl Loop {
         keys.extend(ids.union(&named).map(|id| Key::new(Table::Rollout, id.as_str())));
         Wanted { named, keys }
     }
-    /// Reads it into the picture.
+    /// Reads it into the projection.
     pub(super) async fn read_wanted(&mut self, Wanted { named, keys }: Wanted) -> Result<(), Error> {
         if keys.is_empty() {
             return Ok(());

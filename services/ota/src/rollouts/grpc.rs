@@ -10,7 +10,7 @@ use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal, Violations};
 use midshift_core::rollout::dry_run::dry_run;
 use midshift_core::rollout::objects;
-use midshift_core::rollout::projection::View;
+use midshift_core::rollout::projection::RolloutProjection;
 use midshift_core::rollout::requests::{CheckOnly, Command, Taken, Verb};
 use midshift_core::rollout::rows::{Quarantine, Rollout};
 use midshift_proto::access::caller;
@@ -291,8 +291,9 @@ impl RolloutService {
         let robot_id = call.robot_id.ok_or_else(internal)?;
         let command = command(robot_id.clone());
         let taken = self.act_once(command, by, None, call.check_only, call.request_id).await?;
-        let software =
-            self.ask_projection(move |view: &View, _, _| encode::software(&view.software_of(&robot_id))).await?;
+        let software = self
+            .ask_projection(move |view: &RolloutProjection, _, _| encode::software(&view.software_of(&robot_id)))
+            .await?;
         Ok((Some(software), done_before(taken)))
     }
 

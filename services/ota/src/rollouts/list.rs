@@ -1,4 +1,4 @@
-//! One page of roll-outs, newest first; of those whose ids begin alike, by id. The picture has none that ended long
+//! One page of roll-outs, newest first; of those whose ids begin alike, by id. The projection has none that ended long
 //! ago, so rows are read from the store.
 //!
 //! Invariant: a page costs its own roll-outs and their robots, whatever else has ended.
@@ -51,7 +51,7 @@ impl RolloutService {
         let (rollouts, next_page_token) = self.page(query, size, by).await?;
         let mut counted = Vec::new();
         for rollout in rollouts {
-            // What is under way is counted in the picture.
+            // What is under way is counted in the projection.
             let counts = if rollout.phase.is_over() { Some(self.counts(&rollout.rollout_id).await?) } else { None };
             counted.push((rollout, counts));
         }

@@ -1,5 +1,5 @@
-//! The loop: take what is new, decide, sign, commit. A conflict means that somebody else decided too: the picture is
-//! built again. Of several processes on one store one leads and does all that; the others keep their picture by rows
+//! The loop: take what is new, decide, sign, commit. A conflict means that somebody else decided too: the projection is
+//! built again. Of several processes on one store one leads and does all that; the others keep their projection by rows
 //! alone (`standby`).
 //!
 //! Invariant: the view has absorbed the whole feed before anything is decided on it; only a process that leads plans,
@@ -14,10 +14,10 @@ use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
 use midshift_core::lead::{OtaLeader, Own, Seat, Stance};
 use midshift_core::limits;
-use midshift_core::picture;
+use midshift_core::projection;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::bugs::Bugs;
-use midshift_core::rollout::projection::View;
+use midshift_core::rollout::projection::RolloutProjection;
 use midshift_core::rollout::requests::{CheckOnly, Taken};
 use midshift_core::rollout::retention::needed_bundles;
 use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, cycle, decide_request, ended, obeyed, tell_damaged};
@@ -64,7 +64,7 @@ pub struct Planner {
 
 pub(super) struct Loop {
     pub(super) parts: Parts,
-    pub(super) view: View,
+    pub(super) view: RolloutProjection,
     pub(super) seq: Seq,
     pub(super) board: Board,
     dirty: Dirty<Live>,
@@ -106,7 +106,7 @@ async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Error>
     }
     let started = parts.clock.now();
     let dirty = parts.board.watch();
-    let view = View::new(parts.site.clone(), started, started);
+    let view = RolloutProjection::new(parts.site.clone(), started, started);
     let board = Board::new();
     // A store of one process is its process' alone; and a simulation's, whose runs must be the same again.
     let me = match parts.store.is_shared() {
@@ -197,7 +197,7 @@ impl Loop {
     /// As after a start: everybody counts as heard now, and nothing is remembered.
     fn begin_to_lead(&mut self) {
         self.started = self.parts.clock.now();
-        self.view = View::new(self.parts.site.clone(), self.started, self.started);
+        self.view = RolloutProjection::new(self.parts.site.clone(), self.started, self.started);
         self.heard = self.board.keys().cloned().collect();
         // Said anew once robots could say what they run.
         self.say_at_ms = 0;
@@ -227,7 +227,7 @@ impl Loop {
         self.lead_no_more();
     }
 
-    /// Builds the picture from nothing.
+    /// Builds the projection from nothing.
     pub(super) async fn rebuild(&mut self) -> Result<(), Error> {
         self.take_part().await?;
         self.own.clear();
@@ -237,7 +237,7 @@ impl Loop {
         let snapshot = lead::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
         let now = self.parts.clock.now();
         let served = self.view.served_ms(&now);
-        let mut next = View::new(self.parts.site.clone(), self.started, now);
+        let mut next = RolloutProjection::new(self.parts.site.clone(), self.started, now);
         next.bugs = self.parts.bugs;
         next.carry_over(&mut self.view);
         self.view = next;
@@ -256,12 +256,12 @@ impl Loop {
             }
         }
         metrics::counter!("midshift_ota_rebuilds_total").increment(1);
-        // Questions that are still open are answered from this picture.
+        // Questions that are still open are answered from this projection.
         let wanted = self.wanted(&[]);
         self.read_wanted(wanted).await
     }
 
-    /// One turn; true: there is more to do at once. An error: the picture can no longer be trusted.
+    /// One turn; true: there is more to do at once. An error: the projection can no longer be trusted.
     async fn turn(&mut self, requests: Vec<Request>) -> Result<bool, ()> {
         self.take_heartbeats();
         let unreadable = |error| tracing::warn!(%error, "roll-outs cannot read the store");
@@ -331,7 +331,7 @@ impl Loop {
         self.read_wanted(wanted).await.map_err(unreadable)?;
         let renewal = match self.seat.stance(now.link) {
             Stance::StepDown => {
-                // What was planned a moment ago is dropped, and with it the picture that holds it.
+                // What was planned a moment ago is dropped, and with it the projection that holds it.
                 self.rebuild().await.map_err(unreadable)?;
                 return self.assist(requests).await.map(|()| false);
             }
@@ -382,7 +382,7 @@ impl Loop {
         Ok(more)
     }
 
-    /// Answers every question from the picture, which holds only what is committed at this moment.
+    /// Answers every question from the projection, which holds only what is committed at this moment.
     pub(super) fn answer(&mut self, now: Now) {
         for question in std::mem::take(&mut self.questions) {
             (question.answer)(&self.view, &self.board, &now);
@@ -436,7 +436,7 @@ impl Loop {
     ) -> Result<(), ()> {
         let renews = renewal.is_some();
         let items: Vec<Item> = renewal.into_iter().chain(plan.items).collect();
-        let about: Vec<(Option<Seq>, u64)> = items.iter().map(|i| (obeyed(i), picture::entries_of(i))).collect();
+        let about: Vec<(Option<Seq>, u64)> = items.iter().map(|i| (obeyed(i), projection::entries_of(i))).collect();
         let results = if items.is_empty() { Vec::new() } else { self.parts.store.commit(items).await };
         if renews && results.first().is_some_and(Result::is_ok) {
             self.seat.claimed(now.link);

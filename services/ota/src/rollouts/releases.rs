@@ -11,7 +11,7 @@ use midshift_core::identity::Actor;
 use midshift_core::ids::BundleId;
 use midshift_core::limits;
 use midshift_core::rollout::Plan;
-use midshift_core::rollout::projection::View;
+use midshift_core::rollout::projection::RolloutProjection;
 use midshift_core::rollout::rows::Bundle;
 use midshift_core::rows::Table;
 use midshift_core::task::raw::parse_version;
@@ -28,7 +28,7 @@ pub async fn known_bundles(store: &dyn Store) -> Result<usize, midshift_store::E
 }
 
 /// Makes the rows say what the release says.
-pub fn take_release(view: &mut View, now: Now, newest: Option<&Newest>, plan: &mut Plan) {
+pub fn take_release(view: &mut RolloutProjection, now: Now, newest: Option<&Newest>, plan: &mut Plan) {
     let releases = newest.map(|newest| newest.releases.as_slice()).unwrap_or_default();
     let mut changed = Vec::new();
     let mut listed = BTreeSet::new();

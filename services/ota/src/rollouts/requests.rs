@@ -3,17 +3,17 @@
 use midshift_core::ids::RolloutId;
 use midshift_core::reason::Refusal;
 use midshift_core::rollout::Board;
-use midshift_core::rollout::projection::View;
+use midshift_core::rollout::projection::RolloutProjection;
 use midshift_core::rollout::requests::{Ask, Taken};
 use midshift_core::time::Now;
 use tokio::sync::oneshot;
 
-/// What is made of the picture for whoever asked.
-pub type Answer = Box<dyn FnOnce(&View, &Board, &Now) + Send>;
+/// What is made of the projection for whoever asked.
+pub type Answer = Box<dyn FnOnce(&RolloutProjection, &Board, &Now) + Send>;
 
-/// A question about the picture as it is now.
+/// A question about the projection as it is now.
 pub struct Question {
-    /// Roll-outs that it is about: they are in the picture when it is answered, if they are there.
+    /// Roll-outs that it is about: they are in the projection when it is answered, if they are there.
     pub about: Vec<RolloutId>,
     pub answer: Answer,
 }

@@ -8,7 +8,7 @@ use midshift_core::ids::RolloutId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::Board;
-use midshift_core::rollout::projection::View;
+use midshift_core::rollout::projection::RolloutProjection;
 use midshift_core::rollout::requests::{Ask, CheckOnly, Command, Taken};
 use midshift_core::rollout::spec::PROBATION_DEFAULT_MS;
 use midshift_core::rows::{Revision, Seq};
@@ -30,7 +30,7 @@ pub struct RolloutService {
     requests: mpsc::Sender<Request>,
     /// Where lists of roll-outs are read: most of them have ended.
     pub(super) store: Arc<dyn Store>,
-    /// Position up to which the picture is committed; changes with it.
+    /// Position up to which the projection is committed; changes with it.
     pub(super) changed: channel::Receiver<Seq>,
     pub(super) shutdown: CancellationToken,
     pub(super) ota: OtaService,
@@ -69,28 +69,28 @@ impl RolloutService {
             mpsc::error::TrySendError::Closed(_) => Refusal::new(Kind::Unavailable, Code::ShuttingDown),
         })
     }
-    /// Runs `look` on the picture and gives its answer. Of roll-outs that have ended the picture has only what
+    /// Runs `look` on the projection and gives its answer. Of roll-outs that have ended the projection has only what
     /// something names.
     ///
     /// # Errors
     /// If the planner does not run.
     pub async fn ask_projection<T: Send + 'static>(
         &self,
-        look: impl FnOnce(&View, &Board, &Now) -> T + Send + 'static,
+        look: impl FnOnce(&RolloutProjection, &Board, &Now) -> T + Send + 'static,
     ) -> Result<T, Refusal> {
         self.ask_about(Vec::new(), look).await
     }
-    /// The same, of a picture that has these roll-outs, ended or not.
+    /// The same, of a projection that has these roll-outs, ended or not.
     ///
     /// # Errors
     /// If the planner does not run.
     pub async fn ask_about<T: Send + 'static>(
         &self,
         about: Vec<RolloutId>,
-        look: impl FnOnce(&View, &Board, &Now) -> T + Send + 'static,
+        look: impl FnOnce(&RolloutProjection, &Board, &Now) -> T + Send + 'static,
     ) -> Result<T, Refusal> {
         let (reply, answer) = oneshot::channel();
-        let look = move |view: &View, board: &Board, now: &Now| drop(reply.send(look(view, board, now)));
+        let look = move |view: &RolloutProjection, board: &Board, now: &Now| drop(reply.send(look(view, board, now)));
         self.send(Request::Question(Question { about, answer: Box::new(look) })).await?;
         answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::ShuttingDown))
     }

@@ -1,13 +1,13 @@
-//! A process that does not lead: it keeps its picture by rows alone, answers from it, and carries out what people ask.
+//! A process that does not lead: it keeps its projection by rows alone, answers from it, and carries out what people ask.
 //!
 //! Invariant: it decides nothing but commands, tells nothing but that a file which it was to hand out is damaged, and
-//! signs nothing. A command is decided on the picture, committed on the condition that nothing of it has changed, and
+//! signs nothing. A command is decided on the projection, committed on the condition that nothing of it has changed, and
 //! decided anew if something has; the process that leads obeys what is written.
 
 use super::reconcile::Loop;
 use super::requests::Request;
 use midshift_core::limits;
-use midshift_core::picture;
+use midshift_core::projection;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::requests::{Ask, Taken};
 use midshift_core::rollout::{LOGS, Plan, decide_request, follow_rows, reread, tell_damaged};
@@ -41,7 +41,7 @@ impl Loop {
         Ok(seen?)
     }
 
-    /// Answers, and carries out what people ask. An error: the picture can no longer be trusted.
+    /// Answers, and carries out what people ask. An error: the projection can no longer be trusted.
     pub(super) async fn assist(&mut self, requests: Vec<Request>) -> Result<(), ()> {
         let unread = |error| tracing::warn!(%error, "roll-outs cannot read what has ended");
         let wanted = self.wanted(&requests);
@@ -90,7 +90,7 @@ impl Loop {
         }
     }
 
-    /// The answer to whoever asked. An error: what came of it may not be in the picture.
+    /// The answer to whoever asked. An error: what came of it may not be in the projection.
     async fn carry_out(&mut self, ask: &Ask) -> Result<Result<Taken, Refusal>, Error> {
         for _ in 0..limits::COMMAND_TRIES {
             let mut plan = Plan::default();
@@ -104,7 +104,7 @@ impl Loop {
             if plan.items.is_empty() {
                 return Ok(taken);
             }
-            let keys = picture::touched(&plan.items);
+            let keys = projection::touched(&plan.items);
             let results = self.parts.store.commit(plan.items).await;
             let any_applied = results.iter().any(Result::is_ok);
             match results.into_iter().find_map(Result::err) {

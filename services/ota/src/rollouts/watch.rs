@@ -3,7 +3,7 @@
 //! What is told changes with rows, with tasks that end on trial, with what robots say of their downloads, and with
 //! time. Rows of this service wake a watcher; for the rest it looks again each second.
 //!
-//! Invariant: each look is answered from a picture that has come up to the head of the feed since it was asked for,
+//! Invariant: each look is answered from a projection that has come up to the head of the feed since it was asked for,
 //! whether the process leads or not, and holds committed rows alone. So a client that goes on at another process is
 //! told no older row than it was told before.
 
@@ -13,7 +13,7 @@ use midshift_core::gates::TaskTally;
 use midshift_core::identity::Caller;
 use midshift_core::ids::RolloutId;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::rollout::projection::View;
+use midshift_core::rollout::projection::RolloutProjection;
 use midshift_core::rollout::{Board, objects, verdict};
 use midshift_core::rows::Revision;
 use midshift_core::time::Now;
@@ -52,7 +52,7 @@ impl Told {
     /// What is new; none: nothing is, or the roll-out is gone. Says also whether it has ended.
     fn next(
         &mut self,
-        view: &View,
+        view: &RolloutProjection,
         board: &Board,
         now: &Now,
         id: &RolloutId,

@@ -1,6 +1,6 @@
 //! A service over a store in memory, and somebody who plays fleet: either by core's own law or row by row.
 
-use midshift_core::fleet::projection::{self, View};
+use midshift_core::fleet::projection::{self, FleetProjection};
 use midshift_core::fleet::rows::HoldToken;
 use midshift_core::fleet::{Board, LOGS, Plan, absorb};
 use midshift_core::identity::RobotIdentity;
@@ -91,7 +91,7 @@ impl World {
     /// Fleet obeys everything that is new, once.
     pub async fn fleet_turns(&self) {
         let now = At(NOON).now();
-        let mut view = View::new(self.site.clone(), now, now);
+        let mut view = FleetProjection::new(self.site.clone(), now, now);
         let snapshot = self.store.read(&projection::alive(), projection::named).await.expect("a snapshot");
         view.load(&snapshot.rows, snapshot.seq).expect("rows that can be read");
         let begin = view.marks.get("fleet").map_or(NOON_SEQ, |m| m.row.seq);

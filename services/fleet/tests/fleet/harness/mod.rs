@@ -192,7 +192,7 @@ impl World {
         running.task.await.expect("it ends").expect_err("nobody asked it to")
     }
 
-    /// Ends every reconciler; rows stay, the picture goes.
+    /// Ends every reconciler; rows stay, the projection goes.
     pub async fn stop_fleet(&mut self) {
         for running in self.running.drain(..) {
             running.shutdown.cancel();

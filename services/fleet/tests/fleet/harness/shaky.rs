@@ -30,7 +30,7 @@ pub struct Shaky {
     outrun: Mutex<Option<Table>>,
     /// Items that touch this table are too large.
     narrow: Mutex<Option<Table>>,
-    /// A reading of the picture takes so long.
+    /// A reading of the projection takes so long.
     reads_for: Mutex<Duration>,
     /// A reading of the feed takes so long.
     feeds_for: Mutex<Duration>,
@@ -38,8 +38,8 @@ pub struct Shaky {
     feeds_up_to: Mutex<Option<Seq>>,
     /// Rows and entries that were read through this handle.
     rows_read: AtomicU64,
-    /// Whole pictures that were read through this handle.
-    pictures_read: AtomicU64,
+    /// Whole projections that were read through this handle.
+    projections_read: AtomicU64,
 }
 
 impl Shaky {
@@ -55,7 +55,7 @@ impl Shaky {
             feeds_for: Mutex::new(Duration::ZERO),
             feeds_up_to: Mutex::new(None),
             rows_read: AtomicU64::new(0),
-            pictures_read: AtomicU64::new(0),
+            projections_read: AtomicU64::new(0),
             inner,
             failing: AtomicBool::new(false),
             failed: AtomicU64::new(0),
@@ -82,7 +82,7 @@ impl Shaky {
     pub fn outrun(&self, table: Option<Table>) {
         *self.outrun.lock().expect("not poisoned") = table;
     }
-    /// From now on a reading of the picture takes so long.
+    /// From now on a reading of the projection takes so long.
     pub fn read_for(&self, time: Duration) {
         *self.reads_for.lock().expect("not poisoned") = time;
     }
@@ -98,9 +98,9 @@ impl Shaky {
     pub fn rows_read(&self) -> u64 {
         self.rows_read.swap(0, Ordering::Relaxed)
     }
-    /// Whole pictures read through this handle.
-    pub fn pictures_read(&self) -> u64 {
-        self.pictures_read.load(Ordering::Relaxed)
+    /// Whole projections read through this handle.
+    pub fn projections_read(&self) -> u64 {
+        self.projections_read.load(Ordering::Relaxed)
     }
     fn count(&self, rows: usize) {
         self.rows_read.fetch_add(rows as u64, Ordering::Relaxed);
@@ -173,7 +173,7 @@ impl Store for Shaky {
         self.inner.is_shared()
     }
     async fn commit(&self, items: Vec<Item>) -> Vec<Result<Applied, CommitError>> {
-        // A disk takes time, in which somebody else may plan on the same picture.
+        // A disk takes time, in which somebody else may plan on the same projection.
         tokio::task::yield_now().await;
         if !items.is_empty() && self.freezes.swap(false, Ordering::Relaxed) {
             self.freeze(true);
@@ -234,7 +234,7 @@ impl Store for Shaky {
         self.thaws().await;
         takes(&self.reads_for).await;
         let snapshot = self.inner.read(parts, named).await?;
-        self.pictures_read.fetch_add(1, Ordering::Relaxed);
+        self.projections_read.fetch_add(1, Ordering::Relaxed);
         self.count(snapshot.rows.len());
         Ok(snapshot)
     }

@@ -6,7 +6,7 @@ use midshift_core::gates::{FailureEvidence, TaskTally};
 use midshift_core::identity::Caller;
 use midshift_core::ids::{BundleId, RobotId, RolloutId};
 use midshift_core::rollout::Board;
-use midshift_core::rollout::projection::{Rowed, View};
+use midshift_core::rollout::projection::{RolloutProjection, Rowed};
 use midshift_core::rollout::rows::{Act, Bundle, Countdown, Moments, Phase, Rollout, RolloutRobot, Step, WayBack};
 use midshift_core::rollout::spec::RolloutSpec;
 use midshift_core::rows::{Record, Revision};
@@ -113,14 +113,14 @@ fn robot_id() -> RobotId {
 }
 
 struct Rig {
-    view: View,
+    view: RolloutProjection,
     now: Now,
 }
 
 impl Rig {
     fn new() -> Self {
         let site = Arc::new(text::parse(DEMO).expect("the demo reads"));
-        let mut view = View::new(site, Now::default(), Now::default());
+        let mut view = RolloutProjection::new(site, Now::default(), Now::default());
         let bundle_id = BundleId::parse(&"ab".repeat(32)).expect("an id");
         view.bundles.extend([rowed(bundle(bundle_id.clone()))]);
         view.rollouts.extend([rowed(soaking(bundle_id))]);

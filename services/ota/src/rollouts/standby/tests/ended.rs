@@ -24,7 +24,7 @@ async fn old_world() -> World {
     world
 }
 
-/// Roll-outs and robots of them in the picture.
+/// Roll-outs and robots of them in the projection.
 async fn held(process: &Process) -> (usize, usize) {
     process.face.ask_projection(|view, _, _| (view.rollouts.len(), view.robots.len())).await.expect("it runs")
 }

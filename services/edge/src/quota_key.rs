@@ -1,8 +1,8 @@
-//! Whom a request counts for: its rate, its seats, and what is written down when it is denied.
+//! Whom a request counts for: its rate, its slots, and what is written down when it is denied.
 //!
 //! Invariant: what cannot be proven is never counted for anybody but the address that it came from.
 
-use crate::seats::network;
+use crate::quota::network;
 use midshift_core::identity::{Caller, TokenId, Who};
 use midshift_core::ids::RobotId;
 use midshift_core::reason::Refusal;
@@ -11,7 +11,7 @@ use std::net::IpAddr;
 
 /// Whom a request counts for.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
-pub(crate) enum Asker {
+pub(crate) enum QuotaKey {
     /// A robot.
     Robot(RobotId),
     /// The holder of a token.
@@ -19,26 +19,26 @@ pub(crate) enum Asker {
     /// Everybody of one address, on a port where nobody needs to say who it is.
     Network(IpAddr),
     /// Everybody of one address who has not shown who it is, or something worthless.
-    Stranger(IpAddr),
+    Unauthenticated(IpAddr),
 }
 
-impl Asker {
+impl QuotaKey {
     pub fn from_caller(caller: Result<&Caller, &Refusal>, address: IpAddr) -> Self {
         match caller.map(Caller::who) {
             Ok(Who::Robot(robot_id)) => Self::Robot(robot_id.clone()),
             Ok(Who::Holder { token, .. }) => Self::Token(token.clone()),
             Ok(Who::Local) => Self::Network(network(address)),
-            Ok(Who::Nobody) | Err(_) => Self::Stranger(network(address)),
+            Ok(Who::Nobody) | Err(_) => Self::Unauthenticated(network(address)),
         }
     }
 }
 
-impl fmt::Display for Asker {
+impl fmt::Display for QuotaKey {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Robot(robot_id) => write!(f, "robot:{robot_id}"),
             Self::Token(token) => write!(f, "token:{token}"),
-            Self::Network(network) | Self::Stranger(network) => network.fmt(f),
+            Self::Network(network) | Self::Unauthenticated(network) => network.fmt(f),
         }
     }
 }

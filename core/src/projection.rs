@@ -1,6 +1,6 @@
-//! Rows as a service's picture of them, and one decision being written into both the picture and an item of a commit.
+//! Rows as a service's projection of them, and one decision being written into both the projection and an item of a commit.
 //!
-//! Called by `fleet` and `rollout`. Invariants: a row in a picture is at the revision it has in the store, or one that
+//! Called by `fleet` and `rollout`. Invariants: a row in a projection is at the revision it has in the store, or one that
 //! an item of the running cycle will write; a row written twice in one decision stands in its item once, with the first
 //! expectation and the last body.
 
@@ -28,48 +28,48 @@ pub struct Rowed<R> {
 pub type Slot<R> = BTreeMap<String, Rowed<R>>;
 
 /// What one service knows of the rows.
-pub trait Picture: 'static {
+pub trait Projection: 'static {
     /// Who decides on it.
     const WRITER: Writer;
     /// Rows with a value of a newer version, which stand aside.
     fn unknown_rows(&mut self) -> &mut UnknownRows;
 }
 
-/// A record that a picture keeps.
-pub trait Viewed<P: Picture>: Record {
-    /// The slot of the picture that keeps it.
-    fn slot(picture: &mut P) -> &mut Slot<Self>;
+/// A record that a projection keeps.
+pub trait Projected<P: Projection>: Record {
+    /// The slot of the projection that keeps it.
+    fn slot(projection: &mut P) -> &mut Slot<Self>;
     /// What else changes with it: indices and what must be looked at again. Called after the slot changed.
-    fn changed(_picture: &mut P, _id: &str, _old: Option<&Self>) {}
+    fn changed(_projection: &mut P, _id: &str, _old: Option<&Self>) {}
 }
 
-/// Takes one row as the store has it; none: deleted. What the picture already has is passed over. A row with a value
+/// Takes one row as the store has it; none: deleted. What the projection already has is passed over. A row with a value
 /// that this build does not know is kept aside.
 ///
 /// # Errors
 /// A body that is damaged.
-pub fn take<P: Picture, R: Viewed<P>>(
-    picture: &mut P,
+pub fn take<P: Projection, R: Projected<P>>(
+    projection: &mut P,
     id: &str,
     revision: Revision,
     row: Option<&Row>,
 ) -> Result<(), BadRow> {
     let key = Key::new(R::TABLE, id);
-    let is_known = R::slot(picture).get(id).is_some_and(|known| known.revision >= revision);
-    if is_known || picture.unknown_rows().has(&key, revision) {
+    let is_known = R::slot(projection).get(id).is_some_and(|known| known.revision >= revision);
+    if is_known || projection.unknown_rows().has(&key, revision) {
         return Ok(());
     }
-    picture.unknown_rows().forget(&key);
+    projection.unknown_rows().forget(&key);
     let old = match row.map(|row| (row, row.decode())) {
-        Some((_, Ok(row))) => R::slot(picture).insert(id.to_owned(), Rowed { revision, row }),
+        Some((_, Ok(row))) => R::slot(projection).insert(id.to_owned(), Rowed { revision, row }),
         Some((row, Err(error))) if error.is_unknown() => {
-            picture.unknown_rows().keep_aside(row, &error);
-            R::slot(picture).remove(id)
+            projection.unknown_rows().keep_aside(row, &error);
+            R::slot(projection).remove(id)
         }
         Some((_, Err(error))) => return Err(error),
-        None => R::slot(picture).remove(id),
+        None => R::slot(projection).remove(id),
     };
-    R::changed(picture, id, old.as_ref().map(|r| &r.row));
+    R::changed(projection, id, old.as_ref().map(|r| &r.row));
     Ok(())
 }
 
@@ -121,31 +121,31 @@ impl Outline {
     }
 }
 
-/// Puts a row of a picture back to what it was.
-fn put_back<P: Picture, R: Viewed<P>>(picture: &mut P, id: &str, old: Option<Rowed<R>>) {
+/// Puts a row of a projection back to what it was.
+fn put_back<P: Projection, R: Projected<P>>(projection: &mut P, id: &str, old: Option<Rowed<R>>) {
     let was = match old {
-        Some(old) => R::slot(picture).insert(id.to_owned(), old),
-        None => R::slot(picture).remove(id),
+        Some(old) => R::slot(projection).insert(id.to_owned(), old),
+        None => R::slot(projection).remove(id),
     };
-    R::changed(picture, id, was.as_ref().map(|r| &r.row));
+    R::changed(projection, id, was.as_ref().map(|r| &r.row));
 }
 
-/// Brings one row of a picture back to what it was.
+/// Brings one row of a projection back to what it was.
 type Undo<P> = Box<dyn FnOnce(&mut P) + Send>;
 
 /// A decision under way.
-pub struct Tx<'a, P: Picture> {
-    /// The picture it is made on.
+pub struct Tx<'a, P: Projection> {
+    /// The projection it is made on.
     pub view: &'a mut P,
     /// When it is made.
     pub now: Now,
     item: Item,
     at: BTreeMap<Key, usize>,
-    /// What brings the picture back to before it, newest last.
+    /// What brings the projection back to before it, newest last.
     undo: Vec<Undo<P>>,
 }
 
-impl<'a, P: Picture> Tx<'a, P> {
+impl<'a, P: Projection> Tx<'a, P> {
     /// Begins a decision on behalf of `actor`.
     pub fn new(view: &'a mut P, now: Now, actor: impl Into<Actor>) -> Self {
         Self { view, now, item: Item::new(P::WRITER, actor), at: BTreeMap::new(), undo: Vec::new() }
@@ -160,7 +160,7 @@ impl<'a, P: Picture> Tx<'a, P> {
         self.item.rows.len()
     }
     /// Creates or changes a row.
-    pub fn put<R: Viewed<P>>(&mut self, record: R, kind: &'static str) {
+    pub fn put<R: Projected<P>>(&mut self, record: R, kind: &'static str) {
         let key = record.key();
         let known = R::slot(self.view).get(&*key.id).map_or(Revision(0), |r| r.revision);
         let write = Write::Put { index: record.index(), body: record.body() };
@@ -173,7 +173,7 @@ impl<'a, P: Picture> Tx<'a, P> {
         self.undo.push(Box::new(move |view| put_back::<P, R>(view, &key.id, old)));
     }
     /// Guards a row that is only relied upon: if somebody else changes it first, this decision is not made.
-    pub fn rely<R: Viewed<P>>(&mut self, id: &str) {
+    pub fn rely<R: Projected<P>>(&mut self, id: &str) {
         let key = Key::new(R::TABLE, id);
         if self.at.contains_key(&key) {
             return;
@@ -196,7 +196,7 @@ impl<'a, P: Picture> Tx<'a, P> {
         self.item.facts.push(Fact { log: Log::of(P::WRITER), subject: subject.into(), kind, body: body.into() });
     }
     /// Deletes a row, if there is one.
-    pub fn delete<R: Viewed<P>>(&mut self, id: &str, kind: &'static str) {
+    pub fn delete<R: Projected<P>>(&mut self, id: &str, kind: &'static str) {
         let Some(old) = R::slot(self.view).remove(id) else { return };
         self.note(Key::new(R::TABLE, id), old.revision, Write::Delete, kind);
         R::changed(self.view, id, Some(&old.row));
@@ -232,7 +232,7 @@ impl<'a, P: Picture> Tx<'a, P> {
     pub fn is_too_large(&self) -> bool {
         self.item.is_too_large()
     }
-    /// Gives the decision up: the rows of the picture are as they were before it.
+    /// Gives the decision up: the rows of the projection are as they were before it.
     pub fn take_back(self) -> &'a mut P {
         for undo in self.undo.into_iter().rev() {
             undo(self.view);
@@ -247,13 +247,13 @@ impl<'a, P: Picture> Tx<'a, P> {
     }
 }
 
-/// What a picture derives from the rows of one table.
+/// What a projection derives from the rows of one table.
 pub trait Indexed<R>: Sized {
     /// A row of it changed: brings what is derived from it up to date. Called after the change.
-    fn changed(picture: &mut Self, id: &str, old: Option<&R>);
+    fn changed(projection: &mut Self, id: &str, old: Option<&R>);
 }
 
-/// The picture of a service, with one line for each table: the field, its record, its table, and `Indexed` where
+/// The projection of a service, with one line for each table: the field, its record, its table, and `Indexed` where
 /// something is derived from it. It makes the struct, `new`, `WHOLE`, `carry_over`, and the ways of rows into it.
 ///
 /// 1. `whole`: tables that hold only what is there now, or that are bounded by count. They are read whole, in this
@@ -261,7 +261,7 @@ pub trait Indexed<R>: Sized {
 /// 2. `part`: tables of which it holds what something names.
 /// 3. `kept`: what only this process knows, and what a rebuild leaves alone.
 /// 4. `anew`: what begins anew with each reading of the rows.
-macro_rules! picture {
+macro_rules! projection {
     (
         $(#[$about:meta])*
         pub struct $name:ident of $writer:ident;
@@ -275,8 +275,8 @@ macro_rules! picture {
     ) => {
         $(#[$about])*
         pub struct $name {
-            $($(#[$whole_doc])* pub $whole: $crate::picture::Slot<$whole_record>,)*
-            $($(#[$part_doc])* pub $part: $crate::picture::Slot<$part_record>,)*
+            $($(#[$whole_doc])* pub $whole: $crate::projection::Slot<$whole_record>,)*
+            $($(#[$part_doc])* pub $part: $crate::projection::Slot<$part_record>,)*
             $($(#[$kept_doc])* pub $kept: $kept_type,)*
             $($(#[$anew_doc])* pub $anew: $anew_type,)*
         }
@@ -285,17 +285,17 @@ macro_rules! picture {
             /// Tables that are read whole.
             pub const WHOLE: &'static [$crate::rows::Table] = &[$($crate::rows::Table::$whole_table),*];
 
-            /// An empty picture of the site. `started`: when the service began; `read`: when its rows are read.
+            /// An empty projection of the site. `started`: when the service began; `read`: when its rows are read.
             pub fn new($($arg: $arg_type),*) -> Self {
                 Self {
-                    $($whole: $crate::picture::Slot::new(),)*
-                    $($part: $crate::picture::Slot::new(),)*
+                    $($whole: $crate::projection::Slot::new(),)*
+                    $($part: $crate::projection::Slot::new(),)*
                     $($kept: $kept_begin,)*
                     $($anew: $anew_begin,)*
                 }
             }
 
-            /// Takes over what only this process knows from the picture before it, ahead of the rows.
+            /// Takes over what only this process knows from the projection before it, ahead of the rows.
             pub fn carry_over(&mut self, before: &mut Self) {
                 $(std::mem::swap(&mut self.$kept, &mut before.$kept);)*
             }
@@ -309,7 +309,7 @@ macro_rules! picture {
                 }
             }
 
-            /// Takes one row as the store has it; none: deleted. What the picture already has is passed over.
+            /// Takes one row as the store has it; none: deleted. What the projection already has is passed over.
             ///
             /// # Errors
             /// A body that is not what its table holds.
@@ -319,7 +319,7 @@ macro_rules! picture {
                 revision: $crate::rows::Revision,
                 row: Option<&$crate::rows::Row>,
             ) -> Result<(), $crate::rows::BadRow> {
-                use $crate::picture::take;
+                use $crate::projection::take;
                 match key.table {
                     $($crate::rows::Table::$whole_table => take::<Self, $whole_record>(self, &key.id, revision, row),)*
                     $($crate::rows::Table::$part_table => take::<Self, $part_record>(self, &key.id, revision, row),)*
@@ -328,35 +328,35 @@ macro_rules! picture {
             }
         }
 
-        impl $crate::picture::Picture for $name {
+        impl $crate::projection::Projection for $name {
             const WRITER: $crate::rows::Writer = $crate::rows::Writer::$writer;
             fn unknown_rows(&mut self) -> &mut $crate::unknown_rows::UnknownRows {
                 &mut self.unknown_rows
             }
         }
 
-        $($crate::picture::viewed!($name $whole $whole_record $($whole_index)?);)*
-        $($crate::picture::viewed!($name $part $part_record $($part_index)?);)*
+        $($crate::projection::viewed!($name $whole $whole_record $($whole_index)?);)*
+        $($crate::projection::viewed!($name $part $part_record $($part_index)?);)*
     };
 }
-pub(crate) use picture;
+pub(crate) use projection;
 
-/// Says which field of a picture keeps a record, and whether something is derived from it.
+/// Says which field of a projection keeps a record, and whether something is derived from it.
 macro_rules! viewed {
     ($name:ident $slot:ident $record:ident $($index:ident)?) => {
-        impl $crate::picture::Viewed<$name> for $record {
-            fn slot(picture: &mut $name) -> &mut $crate::picture::Slot<Self> {
-                &mut picture.$slot
+        impl $crate::projection::Projected<$name> for $record {
+            fn slot(projection: &mut $name) -> &mut $crate::projection::Slot<Self> {
+                &mut projection.$slot
             }
-            $(fn changed(picture: &mut $name, id: &str, old: Option<&Self>) {
-                <$name as $index<Self>>::changed(picture, id, old);
+            $(fn changed(projection: &mut $name, id: &str, old: Option<&Self>) {
+                <$name as $index<Self>>::changed(projection, id, old);
             })?
         }
     };
 }
 pub(crate) use viewed;
 
-/// A row as a picture takes it, from an entry of a log.
+/// A row as a projection takes it, from an entry of a log.
 pub fn row_of(entry: &Entry, table: Table) -> Option<Row> {
     let key = Key { table, id: entry.subject.clone() };
     entry.body.clone().map(|body| Row { key, revision: entry.revision, index: entry.index.clone(), body })

@@ -18,7 +18,7 @@ const LIST: &str = "/midshift.task.v1.TaskService/ListTasks";
 const HEALTH: &str = "/grpc.health.v1.Health/Check";
 const WATCH: &str = "/grpc.health.v1.Health/Watch";
 
-/// A port of 64 connections: 16 of them for strangers, a quarter of what the others leave of these for one address.
+/// A port of 64 connections: 16 of them for peers that have not authenticated, a quarter of what the others leave of these for one address.
 fn small() -> Config {
     let tls_handshake = LinkDuration::from_secs(600);
     Config { connections_max: 64, connections_per_network_max: 16, tls_handshake, ..Config::default() }
@@ -56,7 +56,7 @@ async fn addresses_of_strangers_fill_a_share_of_the_port_and_robots_and_people_c
     }
     assert!(silent.len() < 16, "there is room for one more address: {}", silent.len());
     assert!(port.world.counter("midshift_edge_refused_total", ("reason", "strangers_per_network_max")) >= 4);
-    // More of one address than strangers have in all: each is one of them until it has shown who it is, and no longer.
+    // More of one address than may be unauthenticated in all: each is one of them until it has shown who it is, and no longer.
     let mut robots = Vec::new();
     for n in 0..8 {
         let mut robot = port.client(Some(&port.robot(&format!("r{n}")))).await;
@@ -77,26 +77,26 @@ async fn addresses_of_strangers_fill_a_share_of_the_port_and_robots_and_people_c
 #[tokio::test]
 async fn open_calls_of_nobody_have_a_share_of_their_own() {
     let port = Port::with(Config { requests_max: 16, requests_per_principal_max: 8, ..Config::default() }).await;
-    let mut stranger = port.client(None).await;
+    let mut unauthenticated = port.client(None).await;
     let mut open = Vec::new();
-    while let Some(call) = stranger.held(HEALTH).await {
+    while let Some(call) = unauthenticated.held(HEALTH).await {
         open.push(call);
     }
     assert_eq!(open.len(), 2, "a quarter of all, and of that as much as of all");
-    assert_eq!(code(&mut stranger, HEALTH, None).await, Err(Code::TooManyRequests));
+    assert_eq!(code(&mut unauthenticated, HEALTH, None).await, Err(Code::TooManyRequests));
     let mut robot = port.client(Some(&port.robot("r7"))).await;
     assert_eq!(code(&mut robot, SESSION, None).await, Ok("robot:r7".to_owned()));
     drop(open);
-    let again = async { while code(&mut stranger, HEALTH, None).await.is_err() {} };
+    let again = async { while code(&mut unauthenticated, HEALTH, None).await.is_err() {} };
     within(again).await;
 }
 
 #[tokio::test]
 async fn nobody_watches_health_without_signing_in() {
     let port = Port::open().await;
-    let mut stranger = port.client(None).await;
-    assert_eq!(code(&mut stranger, WATCH, None).await, Err(Code::SignInNeeded));
-    assert!(code(&mut stranger, HEALTH, None).await.is_ok());
+    let mut unauthenticated = port.client(None).await;
+    assert_eq!(code(&mut unauthenticated, WATCH, None).await, Err(Code::SignInNeeded));
+    assert!(code(&mut unauthenticated, HEALTH, None).await.is_ok());
     let mut robot = port.client(Some(&port.robot("r7"))).await;
     assert!(code(&mut robot, WATCH, None).await.is_ok());
 }

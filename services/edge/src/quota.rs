@@ -1,6 +1,6 @@
 //! How many may be inside: in total, and of one kind.
 //!
-//! Invariant: what was taken is given back when its [`Seat`] is dropped, also by a panic; a kind of which nobody is inside costs no memory.
+//! Invariant: what was taken is given back when its [`Slot`] is dropped, also by a panic; a kind of which nobody is inside costs no memory.
 //! Used for connections by network, for requests by principal, and for both of who has not shown yet who it is.
 
 use midshift_core::overload::Class;
@@ -34,7 +34,7 @@ struct Taken<K> {
 }
 
 #[derive(Debug)]
-pub(crate) struct Seats<K> {
+pub(crate) struct Quota<K> {
     total_max: usize,
     each: Each,
     taken: Mutex<Taken<K>>,
@@ -42,12 +42,12 @@ pub(crate) struct Seats<K> {
 
 /// One who is inside.
 #[derive(Debug)]
-pub(crate) struct Seat<K: Eq + Hash> {
+pub(crate) struct Slot<K: Eq + Hash> {
     kind: K,
-    of: Arc<Seats<K>>,
+    of: Arc<Quota<K>>,
 }
 
-impl<K: Eq + Hash + Clone> Seats<K> {
+impl<K: Eq + Hash + Clone> Quota<K> {
     pub fn new(total_max: usize, kind_max: usize) -> Arc<Self> {
         Self::with(total_max, Each::Most(kind_max))
     }
@@ -62,8 +62,8 @@ impl<K: Eq + Hash + Clone> Seats<K> {
         Arc::new(Self { total_max, each, taken })
     }
 
-    /// A seat for something of this class, or which limit is reached: the last seats, of all and of each kind, are for higher classes.
-    pub fn claim(self: &Arc<Self>, kind: K, class: Class) -> Result<Seat<K>, Full> {
+    /// A slot for something of this class, or which limit is reached: the last slots, of all and of each kind, are for higher classes.
+    pub fn claim(self: &Arc<Self>, kind: K, class: Class) -> Result<Slot<K>, Full> {
         let mut taken = self.taken();
         let free = class.share(self.total_max).saturating_sub(taken.total);
         if free == 0 {
@@ -79,17 +79,17 @@ impl<K: Eq + Hash + Clone> Seats<K> {
         }
         taken.total += 1;
         *taken.kinds.entry(kind.clone()).or_insert(0) += 1;
-        Ok(Seat { kind, of: self.clone() })
+        Ok(Slot { kind, of: self.clone() })
     }
 }
 
-impl<K> Seats<K> {
+impl<K> Quota<K> {
     fn taken(&self) -> MutexGuard<'_, Taken<K>> {
         self.taken.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl<K: Eq + Hash> Drop for Seat<K> {
+impl<K: Eq + Hash> Drop for Slot<K> {
     fn drop(&mut self) {
         let mut taken = self.of.taken();
         taken.total -= 1;
@@ -117,24 +117,24 @@ mod tests {
 
     #[test]
     fn one_kind_fills_its_own_seats_and_leaves_the_others() {
-        let seats = Seats::new(3, 2);
-        let first = seats.claim("a", Class::Stop).expect("room");
-        let _second = seats.claim("a", Class::Stop).expect("room");
-        assert_eq!(seats.claim("a", Class::Stop).err(), Some(Full::Kind));
-        let _other = seats.claim("b", Class::Stop).expect("room for another kind");
-        assert_eq!(seats.claim("c", Class::Stop).err(), Some(Full::Total));
+        let slots = Quota::new(3, 2);
+        let first = slots.claim("a", Class::Stop).expect("room");
+        let _second = slots.claim("a", Class::Stop).expect("room");
+        assert_eq!(slots.claim("a", Class::Stop).err(), Some(Full::Kind));
+        let _other = slots.claim("b", Class::Stop).expect("room for another kind");
+        assert_eq!(slots.claim("c", Class::Stop).err(), Some(Full::Total));
         drop(first);
-        let _again = seats.claim("a", Class::Stop).expect("a seat that was given back");
+        let _again = slots.claim("a", Class::Stop).expect("a slot that was given back");
     }
 
     #[test]
     fn kinds_that_share_leave_room_for_one_more_kind_however_greedy_they_are() {
-        let seats = Seats::sharing(4_096, 1, 4);
+        let slots = Quota::sharing(4_096, 1, 4);
         let mut inside = Vec::new();
         let mut fill = |kind: u32| {
             let before = inside.len();
-            while let Ok(seat) = seats.claim(kind, Class::Stop) {
-                inside.push(seat);
+            while let Ok(slot) = slots.claim(kind, Class::Stop) {
+                inside.push(slot);
             }
             inside.len() - before
         };
@@ -144,32 +144,32 @@ mod tests {
         for kind in 4..24 {
             assert!(fill(kind) > 0, "kind {kind} finds no room");
         }
-        assert_eq!(Seats::sharing(1, 4, 16).claim(0, Class::Stop).map(drop), Ok(()));
+        assert_eq!(Quota::sharing(1, 4, 16).claim(0, Class::Stop).map(drop), Ok(()));
     }
 
     #[test]
     fn the_lowest_class_is_shed_first_and_the_highest_last() {
-        let seats = Seats::new(10, 10);
+        let slots = Quota::new(10, 10);
         let mut inside = Vec::new();
         let mut fill = |class| {
-            while let Ok(seat) = seats.claim("a", class) {
-                inside.push(seat);
+            while let Ok(slot) = slots.claim("a", class) {
+                inside.push(slot);
             }
             inside.len()
         };
         assert_eq!(Class::ALL.map(&mut fill), [6, 7, 8, 9, 10]);
         inside.truncate(6);
-        assert_eq!(seats.claim("b", Class::Bulk).err(), Some(Full::Total));
-        assert!(seats.claim("b", Class::Status).is_ok());
+        assert_eq!(slots.claim("b", Class::Bulk).err(), Some(Full::Total));
+        assert!(slots.claim("b", Class::Status).is_ok());
     }
 
     #[test]
     fn nothing_is_kept_of_those_who_left() {
-        let seats = Seats::new(10, 10);
+        let slots = Quota::new(10, 10);
         for kind in 0..1000 {
-            drop(seats.claim(kind, Class::Stop).expect("room"));
+            drop(slots.claim(kind, Class::Stop).expect("room"));
         }
-        let taken = seats.taken();
+        let taken = slots.taken();
         assert_eq!((taken.total, taken.kinds.len()), (0, 0));
     }
 

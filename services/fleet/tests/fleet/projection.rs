@@ -1,7 +1,7 @@
-//! Fleet's picture of the rows: kept by the feed and built anew, it is the same.
+//! Fleet's projection of the rows: kept by the feed and built anew, it is the same.
 
 use crate::harness::{Answer, World, jam, obstacle};
-use midshift_core::fleet::projection::{View, alive, named};
+use midshift_core::fleet::projection::{FleetProjection, alive, named};
 use midshift_core::fleet::rows::{HolderState, Place, RobotAuthority, RobotHolder};
 use midshift_core::fleet::{Board, Plan, absorb};
 use midshift_core::reason::Code;
@@ -18,7 +18,7 @@ use rand::{RngExt, SeedableRng};
 use std::collections::BTreeMap;
 
 /// Every slot as text, a line a row.
-fn slots(view: &View) -> BTreeMap<&'static str, Vec<String>> {
+fn slots(view: &FleetProjection) -> BTreeMap<&'static str, Vec<String>> {
     macro_rules! told {
         ($($slot:ident)*) => { BTreeMap::from([$((stringify!($slot), view.$slot.iter().map(|r| format!("{r:?}")).collect())),*]) };
     }
@@ -33,14 +33,14 @@ fn without_empty(mut slots: BTreeMap<&'static str, Vec<String>>) -> BTreeMap<&'s
     slots
 }
 
-/// The reconciler's own picture against one built from the rows, once it has absorbed what it committed last.
-async fn pictures_agree(w: &mut World) {
+/// The reconciler's own projection against one built from the rows, once it has absorbed what it committed last.
+async fn projections_agree(w: &mut World) {
     let mut last = None;
     for _ in 0..8 {
         let kept = w.fleet.look(|view, _, _| slots(view)).await.expect("the reconciler runs");
         let snapshot = w.store.read(&alive(), named).await.expect("a snapshot");
         let now = w.clock.now();
-        let mut view = View::new(w.site.clone(), now, now);
+        let mut view = FleetProjection::new(w.site.clone(), now, now);
         view.load(&snapshot.rows, snapshot.seq).expect("readable rows");
         let (kept, built) = (without_empty(kept), without_empty(slots(&view)));
         if kept == built {
@@ -49,7 +49,7 @@ async fn pictures_agree(w: &mut World) {
         last = Some((kept, built));
         w.step().await;
     }
-    let (kept, built) = last.expect("two pictures");
+    let (kept, built) = last.expect("two projections");
     for (slot, rows) in kept {
         assert_eq!(rows, built[slot], "{slot}: kept by the feed, and built anew");
     }
@@ -114,10 +114,10 @@ async fn random_shift(site: &'static str, stands: &[&str], goals: &[&str], seed:
             w.start_fleet();
             w.step().await;
         }
-        pictures_agree(&mut w).await;
+        projections_agree(&mut w).await;
     }
     all_is_well_again(&mut w).await;
-    pictures_agree(&mut w).await;
+    projections_agree(&mut w).await;
     w.lawful().await;
 }
 
@@ -158,14 +158,14 @@ async fn all_is_well_again(w: &mut World) {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_picture_built_from_rows_is_not_set_back_by_older_entries_and_goes_on_behind_its_mark() {
+async fn a_projection_built_from_rows_is_not_set_back_by_older_entries_and_goes_on_behind_its_mark() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
     w.submit("T1", "A", "B").await;
     w.until_phase("T1", Phase::Succeeded).await;
     let snapshot = w.store.read(&alive(), named).await.expect("a snapshot");
     let now = w.clock.now();
-    let mut view = View::new(w.site.clone(), now, now);
+    let mut view = FleetProjection::new(w.site.clone(), now, now);
     view.load(&snapshot.rows, snapshot.seq).expect("readable rows");
     let mark = view.marks["fleet"].row.seq;
     assert!(mark > Seq(0) && view.absorbed == mark);
@@ -182,7 +182,7 @@ async fn a_picture_built_from_rows_is_not_set_back_by_older_entries_and_goes_on_
 }
 
 #[tokio::test(start_paused = true)]
-async fn the_picture_kept_by_the_feed_is_the_one_built_from_the_rows_after_any_shift() {
+async fn the_projection_kept_by_the_feed_is_the_one_built_from_the_rows_after_any_shift() {
     for seed in 0..12 {
         random_shift(CORRIDOR, &["park-a", "park-b"], &["A", "B"], seed).await;
     }

@@ -17,15 +17,15 @@ use tokio::sync::watch;
 use webpki::EndEntityCert;
 
 /// Everybody a directory knows.
-pub struct Known {
+pub struct SitePrincipals {
     site_id: SiteId,
     clock: Arc<dyn Clock>,
     directory: watch::Sender<Arc<Directory>>,
     changed: watch::Sender<u64>,
 }
 
-impl Known {
-    /// Of this site; nobody but its robots before [`Known::publish`].
+impl SitePrincipals {
+    /// Of this site; nobody but its robots before [`SitePrincipals::publish`].
     pub fn new(site_id: SiteId, clock: Arc<dyn Clock>) -> Self {
         let (directory, changed) = (watch::Sender::new(Arc::default()), watch::Sender::new(0));
         Self { site_id, clock, directory, changed }
@@ -70,7 +70,7 @@ impl Known {
     }
 }
 
-impl Principals for Known {
+impl Principals for SitePrincipals {
     fn admit(&self, peer: &Peer) -> Result<(), Denied> {
         if let Some(leaf) = &peer.certificate {
             return self.robot(leaf).map(drop);
@@ -148,7 +148,7 @@ mod tests {
         let (mono, beside, ahead) = (us.clone(), us.clone(), stepped_ms.clone());
         let wall = move || Utc(1_000_000).plus_ms(beside.load(Relaxed) / 1000 + ahead.load(Relaxed));
         let clock = Arc::new(WallClock::new(move || mono.load(Relaxed), wall, |_| {}));
-        let known = Known::new(SiteId::parse("factory").expect("a site"), clock);
+        let known = SitePrincipals::new(SiteId::parse("factory").expect("a site"), clock);
         let id = TokenId::new("t1").expect("an id");
         let expires_unix_ms = 1_000_000 + HOUR_MS.cast_signed();
         let (name, digest, person) = ("anna".into(), Digest([7; 32]), None);
