@@ -132,7 +132,10 @@ impl Part {
                 let tests = workspace.tests.iter().filter(|name| *name != e2e::NAME);
                 round.tests(&tests.flat_map(|name| ["--test", name.as_str()]).collect::<Vec<_>>(), count)
             }
-            Self::E2e => e2e::play(round, &e2e::Way::default(), count),
+            Self::E2e => {
+                let only = (!round.only.is_empty()).then(|| round.only.iter().map(String::as_str).collect());
+                e2e::play(round, &e2e::Way { only, ..e2e::Way::default() }, count)
+            }
             Self::Engine => e2e::play(round, &engine::way(round.scope), count),
             Self::Quick => quick::run(round, count),
             Self::Loaded => e2e::play(round, &e2e::Way { is_loaded: true, ..e2e::Way::default() }, count),

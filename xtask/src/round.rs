@@ -24,6 +24,8 @@ pub struct Round<'w> {
     pub tools: Option<Tools>,
     /// How much is asked for.
     pub scope: Scope,
+    /// Beginnings of the names of those end-to-end tests that are asked for; none: all.
+    pub only: &'w [String],
 }
 
 /// What cargo's closing lines added up to.

@@ -27,6 +27,9 @@ pub struct Asked {
     /// `cargo xtask torture`. It takes hours.
     #[arg(long, conflicts_with = "parts")]
     nightly: bool,
+    /// Of the end-to-end tests those alone whose names begin so, as `split::`. Again for more.
+    #[arg(long, value_name = "BEGINNING", requires = "parts")]
+    only: Vec<String>,
     /// Parts to run, in the suite's order whatever the order here; none: all. `quick` is the daily loop.
     #[arg(value_enum)]
     parts: Vec<Part>,
@@ -50,7 +53,7 @@ pub fn test(workspace: &Workspace, asked: &Asked) -> Result<bool> {
         run::tell_person("--no-docker: the part `compose` is left out");
     }
     let (mut lines, mut count) = (Vec::new(), Count::default());
-    let mut round = Round { workspace, tools: None, scope };
+    let mut round = Round { workspace, tools: None, scope, only: &asked.only };
     if parts.iter().any(|part| part.needs_tools()) {
         let (found, took) = timed(|| if asked.install { Tools::install(workspace) } else { Tools::find(workspace) });
         round.tools = Some(found?);

@@ -12,7 +12,7 @@ use midshift_proto::telemetry::v1::{Event, ListEventsRequest, ListRobotsRequest,
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-const TASKS: usize = 40;
+const TASKS: usize = 16;
 const CUT_MS: i64 = 20_000;
 /// Two readings of one wall clock agree within this.
 const SLEW_MS: i64 = 500;

@@ -31,7 +31,7 @@ use std::process::{Command, Output};
 use std::time::Duration;
 
 const ROBOTS: usize = 6;
-const TASKS: usize = 30;
+const TASKS: usize = 20;
 const LIMIT: Duration = Duration::from_secs(60);
 
 /// What the command line prints as JSON.

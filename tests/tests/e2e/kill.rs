@@ -20,7 +20,7 @@ use std::time::Duration;
 
 const ROBOTS: usize = 20;
 /// Tasks of one run.
-pub const TASKS: usize = 100;
+pub const TASKS: usize = 80;
 
 async fn done_and_running(server: SocketAddr) -> anyhow::Result<Option<(usize, Vec<Task>)>> {
     let done = in_states(server, &[TaskState::Succeeded]).await?;

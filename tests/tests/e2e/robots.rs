@@ -25,7 +25,7 @@ use std::process::Command;
 use std::time::Duration;
 
 /// How many times as fast as real the bodies work; clocks are not touched.
-pub const BODY_SPEED: &str = "5";
+pub const BODY_SPEED: &str = "10";
 
 /// Agents in processes of their own, each with its folder, which can be killed and started again; or many in few processes.
 pub struct Robots {

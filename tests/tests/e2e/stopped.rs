@@ -25,7 +25,7 @@ use std::process::Command;
 use std::time::Duration;
 
 const ROBOTS: usize = 8;
-const TASKS: usize = 40;
+const TASKS: usize = 20;
 /// Why somebody stops, which is nothing for a log.
 const REASON: &str = "somebody fell beside dock seven";
 const LIMIT: Duration = Duration::from_secs(60);

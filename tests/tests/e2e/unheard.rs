@@ -20,7 +20,7 @@ use std::path::Path;
 use std::time::Duration;
 
 const ROBOTS: usize = 6;
-const TASKS: usize = 40;
+const TASKS: usize = 16;
 const LIMIT: Duration = Duration::from_secs(60);
 
 /// What a body was told to obey, in order: it boots stopped, and is then told what is stopped.
@@ -44,7 +44,7 @@ async fn a_server_that_is_killed_again_and_again_silences_no_robot_and_the_end_o
     let (address, line) = (server.address, Some(stops.address));
     let robots = Robots::start_beside(dir.path(), address, address, line, &site).await?;
     submit(address, &site, 31, TASKS).await?;
-    for done in [2, 10, 18, 26] {
+    for done in [2, 5, 8, 11] {
         at_work(address, done, &BTreeSet::new()).await?;
         server.kill_and_restart().await?;
     }
@@ -76,7 +76,7 @@ const CUT_MS: i64 = 20_000;
 /// The first moments of it, in which what was on its way arrives.
 const SLEW_MS: i64 = 500;
 /// Tasks of a robot far from people, and more of them than it does in that time.
-const TASKS_AWAY: usize = 8;
+const TASKS_AWAY: usize = 5;
 
 /// Levels that a body was told after it was let go for the first time.
 fn since_free(journal: &Path) -> anyhow::Result<Vec<StopLevel>> {
