@@ -151,7 +151,7 @@ fn cycle_ms(site: &Arc<Site>, router: &Arc<Router>, kind: Fleet, robots: usize, 
     let (mut view, board) = fleet(site, kind, robots, seed, now);
     view.router = router.clone();
     // One slice for all: what the whole fleet costs, however many turns it is cut into.
-    let mut plan = Plan::of(Slice::of(2 * robots));
+    let mut plan = Plan::for_slice(Slice::for_decisions(2 * robots));
     found(&mut view, now, "", &Default::default(), &mut plan);
     let begun = instant();
     cycle(&mut view, now, &board, Pace::Wake, &mut plan);

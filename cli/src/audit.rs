@@ -224,7 +224,7 @@ fn read(path: &Path, noted: &[Mark]) -> Result<v1::VerifyAuditResponse, Exit> {
     }
     let (mut held, mut rows_read) = (Held::new(&export, &marks, midshift_agent::clock::wall()), 0);
     for line in lines()?.skip(1) {
-        held.take(&line?);
+        held.add_line(&line?);
         rows_read += 1;
     }
     let verdicts = held.finish().into_iter().map(|(service, verdict)| {

@@ -23,7 +23,7 @@ macro_rules! seeded_bugs {
         #[cfg(feature = "seeded-bugs")]
         impl Bugs {
             /// With these rules on.
-            pub fn of(bugs: &[SeededBug]) -> Self {
+            pub fn seeded(bugs: &[SeededBug]) -> Self {
                 Self { on: bugs.iter().fold(0, |on, bug| on | 1 << *bug as u64) }
             }
             fn has(self, bug: SeededBug) -> bool {

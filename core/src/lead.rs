@@ -219,7 +219,7 @@ impl<R: LeaderRow> Seat<R> {
         let writer = R::TABLE.writer();
         let mut item = Item::new(writer, writer.as_str());
         let expect = if revision == Revision(0) { Expect::Absent } else { Expect::At(revision) };
-        item.put(&R::new(holder, beat + 1), expect, kind);
+        item.put_row(&R::new(holder, beat + 1), expect, kind);
         item
     }
 }

@@ -90,5 +90,5 @@ where
     let past: Vec<String> = past.map(|k| k.row.id.clone()).collect();
     past.iter().for_each(|id| tx.delete::<CommandKey<C>>(id, "command.forgotten"));
     let key = CommandKey { id: request_id.to_owned(), command: command.clone(), seen, at_unix_ms };
-    tx.put(key, "command.done");
+    tx.put_row(key, "command.done");
 }

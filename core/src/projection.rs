@@ -48,7 +48,7 @@ pub trait Projected<P: Projection>: Record {
 ///
 /// # Errors
 /// A body that is damaged.
-pub fn take<P: Projection, R: Projected<P>>(
+pub fn apply_row<P: Projection, R: Projected<P>>(
     projection: &mut P,
     id: &str,
     revision: Revision,
@@ -109,7 +109,7 @@ pub struct Outline {
 
 impl Outline {
     /// That of an item.
-    pub fn of(item: &Item) -> Self {
+    pub fn from_item(item: &Item) -> Self {
         Self::new(kind_of(item), item.rows.iter().map(|row| &row.key))
     }
     /// That of a decision of this kind on these rows.
@@ -160,7 +160,7 @@ impl<'a, P: Projection> Tx<'a, P> {
         self.item.rows.len()
     }
     /// Creates or changes a row.
-    pub fn put<R: Projected<P>>(&mut self, record: R, kind: &'static str) {
+    pub fn put_row<R: Projected<P>>(&mut self, record: R, kind: &'static str) {
         let key = record.key();
         let known = R::slot(self.view).get(&*key.id).map_or(Revision(0), |r| r.revision);
         let write = Write::Put { index: record.index(), body: record.body() };
@@ -180,7 +180,7 @@ impl<'a, P: Projection> Tx<'a, P> {
         }
         let known = R::slot(self.view).get(id).map(|r| r.revision);
         self.at.insert(key.clone(), self.item.rows.len());
-        self.item.keep(key, known.map_or(Expect::Absent, Expect::At));
+        self.item.keep_row(key, known.map_or(Expect::Absent, Expect::At));
     }
     /// Guards the silence of a robot: if anybody hears it first, this decision is not made.
     pub fn rely_on_silence(&mut self, robot_id: &RobotId) {
@@ -191,9 +191,9 @@ impl<'a, P: Projection> Tx<'a, P> {
         self.item.audit(note);
     }
     /// States a fact beside the rows.
-    pub fn tell(&mut self, subject: &str, kind: &'static str, body: &impl serde::Serialize) {
+    pub fn add_fact(&mut self, subject: &str, kind: &'static str, body: &impl serde::Serialize) {
         let body = serde_json::to_string(body).unwrap_or_else(|e| unreachable!("plain fields: {e}"));
-        self.item.facts.push(Fact { log: Log::of(P::WRITER), subject: subject.into(), kind, body: body.into() });
+        self.item.facts.push(Fact { log: Log::of_writer(P::WRITER), subject: subject.into(), kind, body: body.into() });
     }
     /// Deletes a row, if there is one.
     pub fn delete<R: Projected<P>>(&mut self, id: &str, kind: &'static str) {
@@ -221,7 +221,7 @@ impl<'a, P: Projection> Tx<'a, P> {
     }
     /// What it is about.
     pub fn outline(&self) -> Outline {
-        Outline::of(&self.item)
+        Outline::from_item(&self.item)
     }
     /// Why it is not decided: it touches a row that is kept aside.
     pub fn unknown_row(&mut self) -> Option<Reason> {
@@ -319,10 +319,10 @@ macro_rules! projection {
                 revision: $crate::rows::Revision,
                 row: Option<&$crate::rows::Row>,
             ) -> Result<(), $crate::rows::BadRow> {
-                use $crate::projection::take;
+                use $crate::projection::apply_row;
                 match key.table {
-                    $($crate::rows::Table::$whole_table => take::<Self, $whole_record>(self, &key.id, revision, row),)*
-                    $($crate::rows::Table::$part_table => take::<Self, $part_record>(self, &key.id, revision, row),)*
+                    $($crate::rows::Table::$whole_table => apply_row::<Self, $whole_record>(self, &key.id, revision, row),)*
+                    $($crate::rows::Table::$part_table => apply_row::<Self, $part_record>(self, &key.id, revision, row),)*
                     _ => Ok(()),
                 }
             }

@@ -131,7 +131,7 @@ impl Violations {
         self.0.push(Violation { field: field.into(), description: description.into() });
     }
     /// Takes the value of `result`, or notes the error under `field`.
-    pub fn take<T, E: fmt::Display>(&mut self, field: &str, result: Result<T, E>) -> Option<T> {
+    pub fn accept<T, E: fmt::Display>(&mut self, field: &str, result: Result<T, E>) -> Option<T> {
         result.map_err(|e| self.add(field, e.to_string())).ok()
     }
     /// `Ok` if nothing was noted.

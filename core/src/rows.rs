@@ -210,7 +210,7 @@ impl Log {
         }
     }
     /// The log that row changes of `writer` go to.
-    pub const fn of(writer: Writer) -> Self {
+    pub const fn of_writer(writer: Writer) -> Self {
         match writer {
             Writer::Task => Self::Task,
             Writer::Fleet => Self::Fleet,
@@ -470,20 +470,20 @@ impl Item {
     }
     /// Creates a row.
     pub fn create<R: Record>(&mut self, record: &R, kind: &'static str) -> &mut Self {
-        self.put(record, Expect::Absent, kind)
+        self.put_row(record, Expect::Absent, kind)
     }
     /// Changes a row that stands at `revision`.
     pub fn update<R: Record>(&mut self, record: &R, revision: Revision, kind: &'static str) -> &mut Self {
-        self.put(record, Expect::At(revision), kind)
+        self.put_row(record, Expect::At(revision), kind)
     }
     /// Creates or changes a row.
-    pub fn put<R: Record>(&mut self, record: &R, expect: Expect, kind: &'static str) -> &mut Self {
+    pub fn put_row<R: Record>(&mut self, record: &R, expect: Expect, kind: &'static str) -> &mut Self {
         let write = Write::Put { index: record.index(), body: record.body() };
         self.rows.push(RowChange { key: record.key(), expect, write, kind });
         self
     }
     /// Guards a row that is only relied upon.
-    pub fn keep(&mut self, key: Key, expect: Expect) -> &mut Self {
+    pub fn keep_row(&mut self, key: Key, expect: Expect) -> &mut Self {
         self.rows.push(RowChange { key, expect, write: Write::Keep, kind: "" });
         self
     }

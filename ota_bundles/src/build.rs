@@ -61,7 +61,7 @@ pub fn build(folder: &Path, out: &Path, progress: &mut dyn FnMut(u64)) -> Result
     let draft = read_draft(folder)?;
     check_files(&draft)?;
     // The rules first, with lengths and digests that stand in: nobody waits for gigabytes to hear of a typing error.
-    manifest(&draft, |_| (Digest::of(b""), 1)).check()?;
+    manifest(&draft, |_| (Digest::of_content(b""), 1)).check()?;
     if out.exists() {
         return Err(Error::Io { doing: "making", path: out.to_owned(), source: taken() });
     }

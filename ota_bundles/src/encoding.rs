@@ -196,7 +196,7 @@ mod tests {
         let (mut out, mut base) = (Vec::new(), base.map(Cursor::new));
         let base = base.as_mut().map(|b| b as &mut dyn Base);
         let encoded = encode_cut(cut, base, &mut &*file, file.len() as u64, &mut out, u64::MAX).expect("writes");
-        assert_eq!(encoded, Some(Encoded { digest: Digest::of(&out), length: out.len() as u64 }));
+        assert_eq!(encoded, Some(Encoded { digest: Digest::of_content(&out), length: out.len() as u64 }));
         out
     }
 

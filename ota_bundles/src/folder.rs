@@ -254,8 +254,11 @@ impl Folder {
         self.must_not_wait(keys)?;
         let manifest = inspect(bundle)?;
         let document = manifest.to_bytes();
-        let mut files =
-            vec![FileTarget { name: manifest.target(), digest: Digest::of(&document), length: document.len() as u64 }];
+        let mut files = vec![FileTarget {
+            name: manifest.target(),
+            digest: Digest::of_content(&document),
+            length: document.len() as u64,
+        }];
         files.extend(manifest.components.iter().map(|c| FileTarget {
             name: c.target(),
             digest: c.digest,
@@ -270,7 +273,7 @@ impl Folder {
             copy(&bundle.join(&file.name), &self.file(&file.name, file.digest))?;
         }
         files.extend(ways);
-        Ok((manifest, self.put(&sign_targets(previous.as_deref(), &files, &[], expires, keys)?)?))
+        Ok((manifest, self.publish(&sign_targets(previous.as_deref(), &files, &[], expires, keys)?)?))
     }
 
     /// Signs a targets document that lists a bundle no more, nor files that only it has. The files stay in this folder: the document
@@ -281,7 +284,7 @@ impl Folder {
     pub fn withdraw(&self, bundle: &str, keys: &[&SecretKey], now: Utc) -> Result<(Manifest, Signed), Error> {
         self.must_not_wait(keys)?;
         let is_meant = |m: &Manifest| {
-            format!("{}-{}", m.name, m.version) == bundle || Digest::of(&m.to_bytes()).to_string() == bundle
+            format!("{}-{}", m.name, m.version) == bundle || Digest::of_content(&m.to_bytes()).to_string() == bundle
         };
         let (meant, others): (Vec<Manifest>, Vec<Manifest>) = self.check()?.bundles.into_iter().partition(is_meant);
         let Some(withdrawn) = meant.into_iter().next() else {
@@ -297,7 +300,7 @@ impl Folder {
         let known = previous.as_deref().map(listed).transpose()?.unwrap_or_default();
         gone.extend(ways_to(&lost, &known).map(str::to_owned));
         let signed = sign_targets(previous.as_deref(), &[], &gone, now.plus_ms(PEOPLE_LIFE_MS), keys)?;
-        Ok((withdrawn, self.put(&signed)?))
+        Ok((withdrawn, self.publish(&signed)?))
     }
 
     /// Adds a set of keys that sign directives, as `bundle rekey` made it, and signs the targets document that lists it.
@@ -318,13 +321,14 @@ impl Folder {
         if let Some(before) = &before {
             KeySet::open(envelope, next, before.keys.iter().chain(&set.keys)).map_err(|e| refused(e.to_string()))?;
         }
-        let file = FileTarget { name: set.target(), digest: Digest::of(envelope), length: envelope.len() as u64 };
+        let file =
+            FileTarget { name: set.target(), digest: Digest::of_content(envelope), length: envelope.len() as u64 };
         let previous = self.newest("targets")?.map(|(_, document)| document);
         let add = std::slice::from_ref(&file);
         let signed = sign_targets(previous.as_deref(), add, &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?;
         let path = self.file(&file.name, file.digest);
         midshift_durable::replace(&path, envelope).map_err(io("writing", &path))?;
-        Ok((set, self.put(&signed)?))
+        Ok((set, self.publish(&signed)?))
     }
 
     /// Signs the newest targets document anew, with the next number and a year of its own: after a root that changes who signs, or when it ends.
@@ -336,7 +340,7 @@ impl Folder {
         let Some((_, previous)) = self.newest("targets")? else {
             return Err(Refusal::field("repository", "no targets document was signed yet").into());
         };
-        self.put(&sign_targets(Some(&previous), &[], &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?)
+        self.publish(&sign_targets(Some(&previous), &[], &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?)
     }
 
     /// No document waits, and each of `keys` is asked for.
@@ -369,10 +373,10 @@ impl Folder {
         for handed in handed {
             document = merge_targets(&document, handed, &asked)?;
         }
-        self.put(&add_signatures(&document, keys)?)
+        self.publish(&add_signatures(&document, keys)?)
     }
 
-    fn put(&self, document: &[u8]) -> Result<Signed, Error> {
+    fn publish(&self, document: &[u8]) -> Result<Signed, Error> {
         if check_targets(&self.root()?.1, document).is_err() {
             self.write(PENDING, document)?;
             return Ok(Signed::Pending);
@@ -416,11 +420,11 @@ impl Folder {
             }
             if target.name.ends_with(".manifest") && path.exists() {
                 let bytes = fs::read(&path).map_err(io("reading", &path))?;
-                bundles.extend(bad.take(&target.name, Manifest::from_bytes(&bytes)));
+                bundles.extend(bad.accept(&target.name, Manifest::from_bytes(&bytes)));
             }
             if KeySet::is_named(&target.name) && path.exists() {
                 let bytes = fs::read(&path).map_err(io("reading", &path))?;
-                let set = bad.take(&target.name, KeySet::read(&bytes));
+                let set = bad.accept(&target.name, KeySet::read(&bytes));
                 key_set = key_set.into_iter().chain(set).max_by_key(|set| set.number);
             }
         }

@@ -120,6 +120,6 @@ fn check_named(role: &'static str, named: Option<&Metafile>, document: &[u8], ve
     let digest = named.hashes.as_ref().map(|hashes| hex(&hashes.sha256));
     let other = named.version.get() != version
         || named.length.is_some_and(|length| length != document.len() as u64)
-        || digest.is_some_and(|digest| digest != Digest::of(document).to_string());
+        || digest.is_some_and(|digest| digest != Digest::of_content(document).to_string());
     if other { Err(rule(role, "names another document")) } else { Ok(()) }
 }

@@ -83,7 +83,7 @@ impl PublicKey {
     pub fn id(&self) -> KeyId {
         let public = hex(self.0.as_bytes());
         let canonical = format!(r#"{{"keytype":"ed25519","keyval":{{"public":"{public}"}},"scheme":"ed25519"}}"#);
-        KeyId(Digest::of(canonical.as_bytes()))
+        KeyId(Digest::of_content(canonical.as_bytes()))
     }
     /// From its 32 bytes.
     pub fn from_bytes(bytes: &[u8]) -> Option<Self> {

@@ -215,7 +215,7 @@ impl Component {
             safety_class: SafetyClass::None,
             needs: Needs::Restart,
             data_migration: Migration::None,
-            digest: Digest::of(content),
+            digest: Digest::of_content(content),
             length: content.len() as u64,
         }
     }

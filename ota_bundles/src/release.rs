@@ -44,7 +44,7 @@ impl Release {
 
     /// Digest of the manifest: the bundle's name.
     pub fn bundle(&self) -> Digest {
-        Digest::of(self.manifest.as_bytes())
+        Digest::of_content(self.manifest.as_bytes())
     }
 
     /// The manifest, if the targets are signed as the root asks, and list it and all of its components.

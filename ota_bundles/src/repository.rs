@@ -274,7 +274,8 @@ pub fn sign_online(
 }
 
 fn metafile(bytes: &[u8], version: NonZeroU64) -> Result<Metafile, Error> {
-    let meta = json!({"length": bytes.len(), "hashes": {"sha256": Digest::of(bytes).to_string()}, "version": version});
+    let meta =
+        json!({"length": bytes.len(), "hashes": {"sha256": Digest::of_content(bytes).to_string()}, "version": version});
     serde_json::from_value(meta).map_err(|source| Error::Read { role: "snapshot", source })
 }
 

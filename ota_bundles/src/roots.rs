@@ -91,7 +91,7 @@ impl RootDraft {
     ///
     /// # Errors
     /// If it is none, or names keys that are not ed25519: those no root of ours can name.
-    pub fn of(root: &[u8]) -> Result<Self, Error> {
+    pub fn from_root(root: &[u8]) -> Result<Self, Error> {
         let root = read::<Root>("root", root)?.signed;
         let all = |role| {
             let signers = signers(&root, role);

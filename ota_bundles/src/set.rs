@@ -133,7 +133,7 @@ impl SetManifest {
     }
     /// Its name: digest of its bytes.
     pub fn id(&self) -> Digest {
-        Digest::of(&self.to_bytes())
+        Digest::of_content(&self.to_bytes())
     }
     /// Its program.
     pub fn program(&self) -> Option<&Component> {

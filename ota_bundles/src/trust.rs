@@ -209,7 +209,7 @@ impl Trusted {
         let parsed: Signed<Root> = serde_json::from_slice(root).map_err(Error::NoRoot)?;
         Ok(Self {
             root: String::from_utf8_lossy(root).into_owned(),
-            origin: Some(Digest::of(&canonical(&parsed.signed))),
+            origin: Some(Digest::of_content(&canonical(&parsed.signed))),
             timestamp: None,
             snapshot: None,
             targets: None,

@@ -23,11 +23,11 @@ impl Denying {
         Self(Some(told))
     }
     /// Of the port that a request came through; of one that came through none nobody is told.
-    pub fn of<T>(request: &tonic::Request<T>) -> Self {
+    pub fn from_request<T>(request: &tonic::Request<T>) -> Self {
         request.extensions().get::<Self>().cloned().unwrap_or_default()
     }
     /// Tells of a refusal that was for who asked, and of no other. Who showed nothing was denied nothing: it is asked to sign in.
-    pub fn tell(&self, refusal: &Refusal) {
+    pub fn report(&self, refusal: &Refusal) {
         let is_denial = matches!(refusal.kind(), Kind::Denied | Kind::Unauthenticated);
         if let Some(told) = self.0.as_ref().filter(|_| is_denial && refusal.reason.code != Code::SignInNeeded) {
             told.denied(refusal);

@@ -10,7 +10,7 @@ pub struct Leaving(CancellationToken);
 
 impl Leaving {
     /// Of the connection that a request came on. One that came through no port is never asked to go.
-    pub fn of<T>(request: &tonic::Request<T>) -> Self {
+    pub fn from_request<T>(request: &tonic::Request<T>) -> Self {
         request.extensions().get::<Self>().cloned().unwrap_or_default()
     }
     /// Resolves when it is about to be asked to go. Whoever holds a stream on it uses the time to send its peer elsewhere.

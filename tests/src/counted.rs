@@ -24,7 +24,7 @@ impl Counted {
         Arc::new(Self { store, read: AtomicUsize::new(0) })
     }
     /// Rows and entries that were read this way since this was asked last.
-    pub fn take(&self) -> usize {
+    pub fn take_count(&self) -> usize {
         self.read.swap(0, Relaxed)
     }
     fn count<T>(&self, result: Result<T, Error>, size: impl Fn(&T) -> usize) -> Result<T, Error> {

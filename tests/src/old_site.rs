@@ -102,9 +102,9 @@ impl OldSite {
     pub async fn finish(&self, store: &dyn Store) {
         let head = forget(store).await;
         let mut fleet = Item::new(Writer::Fleet, "fleet");
-        fleet.put(&FleetMark { seq: head }, Expect::Absent, "fleet.consumed");
+        fleet.put_row(&FleetMark { seq: head }, Expect::Absent, "fleet.consumed");
         let mut ota = Item::new(Writer::Ota, "ota");
-        ota.put(&OtaMark { seq: head }, Expect::Absent, "ota.consumed");
+        ota.put_row(&OtaMark { seq: head }, Expect::Absent, "ota.consumed");
         commit(store, vec![fleet, ota]).await;
     }
 

@@ -54,10 +54,10 @@ pub async fn make(site: &OldSite, database: &Database, data: &Path, site_id: &Si
     for numbers in OldSite::slices(1..=first_committed - 1) {
         items.extend(site.rows(numbers, &spec));
         if items.len() >= ITEMS_AT_ONCE {
-            tables.put(site_id, std::mem::take(&mut items)).await?;
+            tables.put_items(site_id, std::mem::take(&mut items)).await?;
         }
     }
-    tables.put(site_id, items).await?;
+    tables.put_items(site_id, items).await?;
     tables.close().await?;
     let storage = open(database, data, site_id).await?;
     let store = storage.store();
@@ -121,7 +121,7 @@ impl Tables {
         Ok(Self::Postgres(connection))
     }
 
-    async fn put(&mut self, site_id: &SiteId, items: Vec<Item>) -> anyhow::Result<()> {
+    async fn put_items(&mut self, site_id: &SiteId, items: Vec<Item>) -> anyhow::Result<()> {
         for (table, mut rows) in rows_of(items) {
             match self {
                 Self::Sqlite(connection) => {

@@ -76,7 +76,7 @@ fn decode(base: Option<&[u8]>, way: &[u8], new: &[u8]) -> anyhow::Result<()> {
 }
 
 fn store_content(sets: &mut DiskSets, bytes: &[u8]) -> anyhow::Result<Wanted> {
-    let wanted = Wanted { digest: Digest::of(bytes), length: bytes.len() as u64 };
+    let wanted = Wanted { digest: Digest::of_content(bytes), length: bytes.len() as u64 };
     for (chunk, at) in bytes.chunks(CHUNK_BYTES as usize).zip((0..).step_by(CHUNK_BYTES as usize)) {
         sets.write(&wanted, at, chunk)?;
     }
@@ -93,7 +93,7 @@ fn applied(base: Option<&[u8]>, way: &[u8], new: &[u8], room: &Path) -> anyhow::
         let mut sets = DiskSets::open(folder.path())?;
         let base = base.map(|base| store_content(&mut sets, base)).transpose()?;
         let way = store_content(&mut sets, way)?;
-        let wanted = Wanted { digest: Digest::of(new), length: new.len() as u64 };
+        let wanted = Wanted { digest: Digest::of_content(new), length: new.len() as u64 };
         let begun = Instant::now();
         sets.decode(&wanted, base.map(|base| base.digest).as_ref(), &way)?;
         seconds.push(begun.elapsed().as_secs_f64());
@@ -107,13 +107,13 @@ fn ways(pair: &str, old: &[u8], new: &[u8], room: &Path) -> anyhow::Result<Vec<F
     ensure!(old != new, "{pair}: the two releases are the same");
     let (kib, whole) = (|bytes: usize| bytes as f64 / 1024.0, [new.len() as f64 / 1024.0]);
     let beside_whole = Some(("the file as it is", &whole[..]));
-    let (sha_s, _) = timed(|| Ok(black_box(Digest::of(new))))?;
+    let (sha_s, _) = timed(|| Ok(black_box(Digest::of_content(new))))?;
     let (copy_s, _) = timed(|| Ok(black_box(new.to_vec())))?;
     let (disk_s, _) = timed(|| {
         let mut file = File::create(room.join("raw"))?;
         file.write_all(new)?;
         file.sync_all()?;
-        Ok(black_box(Digest::of(new)))
+        Ok(black_box(Digest::of_content(new)))
     })?;
     let name = |what: &str| format!("{pair}: {what}");
     let mut figures = Vec::new();

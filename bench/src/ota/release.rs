@@ -31,7 +31,7 @@ impl People {
     /// Draws keys and signs the samples: settings only, which is all that simulated robots read.
     pub fn make(dir: &Path) -> anyhow::Result<Self> {
         let made = samples::make(&dir.join("samples"), None, Signer::Throwaway, midshift_agent::clock::wall())?;
-        let id = |bytes: &[u8]| BundleId::parse(&Digest::of(bytes).to_string());
+        let id = |bytes: &[u8]| BundleId::parse(&Digest::of_content(bytes).to_string());
         let bundles = made.bundles.iter().map(|(_, manifest)| id(&manifest.to_bytes())).collect::<Result<_, _>>()?;
         Ok(Self { repository: made.repository, keys: made.keys.context("throw-away keys")?, bundles })
     }

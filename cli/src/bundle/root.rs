@@ -156,7 +156,7 @@ fn sign(repository: &Path, keys: &[PathBuf], signatures: &[PathBuf], out: &Out) 
 
 fn tell_waiting(folder: &Folder, repository: &Path, out: &Out) -> Result<(), Exit> {
     let Some(waiting) = folder.waiting_root()? else { return Ok(()) };
-    let before = RootDraft::of(&folder.root()?.1).map_err(Error::from)?;
+    let before = RootDraft::from_root(&folder.root()?.1).map_err(Error::from)?;
     print_json(&waiting_page(&waiting), out);
     say_waiting(&before, &waiting, out);
     let repository = repository.display();
@@ -226,7 +226,7 @@ fn roles(draft: &RootDraft) -> serde_json::Value {
 fn show(repository: &Path, message_file: Option<&Path>, out: &Out) -> Result<(), Exit> {
     let folder = Folder::open(repository)?;
     let (version, root) = folder.root()?;
-    let (newest, waiting) = (RootDraft::of(&root).map_err(Error::from)?, folder.waiting_root()?);
+    let (newest, waiting) = (RootDraft::from_root(&root).map_err(Error::from)?, folder.waiting_root()?);
     if let Some(path) = message_file {
         let waiting = waiting.as_ref().ok_or_else(|| Refusal::field("message", "no root waits for signatures"));
         let bytes = message(&waiting.map_err(Error::from)?.document).map_err(Error::from)?;

@@ -42,7 +42,7 @@ impl Kind {
         }
     }
     /// Of a row with this action.
-    pub fn of(action: &str) -> Self {
+    pub fn from_action(action: &str) -> Self {
         match action {
             ANCHOR => Self::Anchor,
             CUT => Self::Cut,
@@ -254,7 +254,7 @@ pub fn append(heads: &mut BTreeMap<Writer, Head>, writer: Writer, note: &Note, b
 }
 
 pub(super) fn index_of(n: u64, action: &str) -> Index {
-    Index { state: Some(Kind::of(action).number()), parent: None, order: Some(n.cast_signed()) }
+    Index { state: Some(Kind::from_action(action).number()), parent: None, order: Some(n.cast_signed()) }
 }
 
 macro_rules! chains {

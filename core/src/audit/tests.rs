@@ -223,7 +223,7 @@ fn export() -> (Export, Vec<String>) {
 fn read(export: &Export, lines: &[String]) -> BTreeMap<String, Result<Verified, Broken>> {
     let quoted: Vec<Mark> = lines.iter().flat_map(|line| Mark::in_line(line)).collect();
     let mut held = Held::new(export, &quoted, NOW);
-    lines.iter().for_each(|line| held.take(line));
+    lines.iter().for_each(|line| held.add_line(line));
     held.finish()
 }
 

@@ -222,7 +222,7 @@ impl Chain {
     /// # Errors
     /// What is wrong with it.
     pub fn take_row(&mut self, row: &Row) -> Result<AuditRow, Broken> {
-        let read = self.take(&row.body)?;
+        let read = self.append(&row.body)?;
         let index = index_of(read.n, &read.action);
         let is_kept = *row.key.id == id_of(read.n) && row.revision == Revision(1) && row.index == index;
         let is_own = Table::audit_named(&self.service) == Some(row.key.table);
@@ -233,7 +233,7 @@ impl Chain {
     ///
     /// # Errors
     /// What is wrong with it.
-    pub fn take(&mut self, body: &str) -> Result<AuditRow, Broken> {
+    pub fn append(&mut self, body: &str) -> Result<AuditRow, Broken> {
         let expected = self.head.n + 1;
         let named = |read: Option<&AuditRow>| match read {
             Some(read) if self.rows == 0 => read.n,
@@ -352,7 +352,7 @@ impl Held {
         Self { now, chains: names.map(chain).collect(), verdicts: BTreeMap::new() }
     }
     /// Takes a line behind the first. A chain is not read behind what is wrong with it.
-    pub fn take(&mut self, line: &str) {
+    pub fn add_line(&mut self, line: &str) {
         let named = AuditRow::read(line).map(|row| row.service);
         // A line that cannot be read is of the first chain that has not ended: an export has them one after the other.
         let open = self.chains.iter().find(|(_, chain)| chain.has_more()).map(|(name, _)| name.clone());
@@ -361,7 +361,7 @@ impl Held {
             return;
         }
         let chain = self.chains.entry(service.clone()).or_insert_with(|| Chain::new(&service, [], self.now));
-        if let Err(broken) = chain.take(line) {
+        if let Err(broken) = chain.append(line) {
             self.verdicts.insert(service, broken);
         }
     }

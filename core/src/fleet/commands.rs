@@ -130,7 +130,7 @@ fn clear(tx: &mut Tx, board: &Board, place: Place) {
     };
     let quarantine = place.quarantine.filter(is_of_kept);
     let (place_id, capacity, standing) = (place.place_id, place.capacity, place.standing);
-    tx.put(Place { place_id, capacity, standing, holders: kept, quarantine, cleared }, "place.cleared");
+    tx.put_row(Place { place_id, capacity, standing, holders: kept, quarantine, cleared }, "place.cleared");
 }
 
 /// What people may say of a robot is what it may say of itself.
@@ -247,7 +247,7 @@ pub fn apply(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
         Command::Cordon { robot_id, reason } => {
             let mut control = control(tx, robot_id);
             control.cordon = Some(Cordon { reason: reason.clone(), actor: actor.to_owned(), since: tx.now.utc });
-            tx.put(control, "robot.cordoned");
+            tx.put_row(control, "robot.cordoned");
         }
         Command::Uncordon { robot_id } => {
             let mut control = control(tx, robot_id);
@@ -257,39 +257,43 @@ pub fn apply(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
             control.failures.clear();
             control.unanswered_since = None;
             control.unanswered.clear();
-            tx.put(control, "robot.uncordoned");
+            tx.put_row(control, "robot.uncordoned");
         }
         Command::Retire { robot_id, reason } => {
             let mut control = control(tx, robot_id);
             control.retired = Some(Cordon { reason: reason.clone(), actor: actor.to_owned(), since: tx.now.utc });
-            tx.put(control, "robot.retired");
+            tx.put_row(control, "robot.retired");
         }
         Command::Disown { robot_id, attempt, .. } => {
             let mut control = control(tx, robot_id);
             if !control.disowned.contains(attempt) && control.disowned.len() < limits::REPORTED_LIST_MAX {
                 control.disowned.push(attempt.clone());
             }
-            tx.put(control, "robot.disowned");
+            tx.put_row(control, "robot.disowned");
             tx.view.unknown.remove(robot_id);
             incidents::close_about(tx, Code::AttemptUnknown, robot_id, "the attempt was disowned");
         }
         Command::SettleLoad { robot_id, reason } => {
             let mut control = control(tx, robot_id);
             control.load_settled = Some(load::settle(tx, board, robot_id, reason, actor));
-            tx.put(control, "robot.load_settled");
+            tx.put_row(control, "robot.load_settled");
         }
         Command::Label { robot_id, labels, removed } => {
             let control = control(tx, robot_id);
             let labels = relabeled(control.labels.clone(), labels, removed);
-            tx.put(RobotControl { labels, ..control }, "robot.labeled");
+            tx.put_row(RobotControl { labels, ..control }, "robot.labeled");
         }
         Command::Drain { robot_id, reason, within_ms } => drain::ask(tx, robot_id, reason, actor, *within_ms),
         Command::Undrain { robot_id } => drain::release(tx, robot_id),
         Command::PutPolicy(policy) => {
-            tx.put(policy.clone(), "area.policy_put");
+            tx.put_row(policy.clone(), "area.policy_put");
         }
         Command::ClearPlace { place_id, reason } => {
-            tx.tell(place_id.as_str(), "place.judged_clear", &serde_json::json!({"actor": actor, "reason": reason}));
+            tx.add_fact(
+                place_id.as_str(),
+                "place.judged_clear",
+                &serde_json::json!({"actor": actor, "reason": reason}),
+            );
             let Some(place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
             clear(tx, board, place);
         }

@@ -79,7 +79,7 @@ pub fn found(view: &mut FleetProjection, now: Now, site_text: &str, map: &maps::
             text: site_text.to_owned(),
         };
         if tx.view.sites.get(site.site_id().as_str()).is_none_or(|s| s.row != row) {
-            tx.put(row, "site.loaded");
+            tx.put_row(row, "site.loaded");
         }
     });
     for chunk in site.places().chunks(128) {
@@ -95,7 +95,7 @@ pub fn found(view: &mut FleetProjection, now: Now, site_text: &str, map: &maps::
                     standing: fresh.standing,
                     ..k
                 });
-                tx.put(row, "place.founded");
+                tx.put_row(row, "place.founded");
             }
         });
     }
@@ -180,9 +180,9 @@ fn welcome(view: &mut FleetProjection, now: Now, board: &Board, plan: &mut Plan)
             return;
         }
         plan.decide(view, now, "fleet", |tx| {
-            tx.put(RobotAuthority { robot_id: robot_id.clone(), holder: RobotHolder::None }, "robot.known");
+            tx.put_row(RobotAuthority { robot_id: robot_id.clone(), holder: RobotHolder::None }, "robot.known");
             if !tx.view.control.contains_key(robot_id.as_str()) {
-                tx.put(RobotControl::new(robot_id.clone()), "robot.known");
+                tx.put_row(RobotControl::new(robot_id.clone()), "robot.known");
             }
             desired::compose_policy(tx, &robot_id);
         });
@@ -214,7 +214,7 @@ fn tell_time(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     let written = view.clocks.get("fleet").map(|c| c.row).unwrap_or_default();
     if served.link_ms >= written.link_ms + 1_000 || written == ServiceClock::default() {
         plan.decide(view, now, "fleet", |tx| {
-            tx.put(served, "fleet.served");
+            tx.put_row(served, "fleet.served");
             mark(tx, tx.view.absorbed);
         });
     }

@@ -99,22 +99,22 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn of(decided: u32, failed: u32) -> RobotOutcomes {
+    fn outcomes(decided: u32, failed: u32) -> RobotOutcomes {
         RobotOutcomes { clean: decided - failed, failed }
     }
 
     #[test]
     fn the_bounds_are_where_the_design_says() {
-        assert_eq!((of(10, 2).verdict(), of(11, 2).verdict()), (Verdict::Abort, Verdict::Inconclusive));
-        assert_eq!((of(11, 0).verdict(), of(12, 0).verdict()), (Verdict::Inconclusive, Verdict::Promote));
-        assert_eq!((of(23, 1).verdict(), of(24, 1).verdict()), (Verdict::Inconclusive, Verdict::Promote));
-        assert_eq!(of(0, 0).verdict(), Verdict::Inconclusive);
+        assert_eq!((outcomes(10, 2).verdict(), outcomes(11, 2).verdict()), (Verdict::Abort, Verdict::Inconclusive));
+        assert_eq!((outcomes(11, 0).verdict(), outcomes(12, 0).verdict()), (Verdict::Inconclusive, Verdict::Promote));
+        assert_eq!((outcomes(23, 1).verdict(), outcomes(24, 1).verdict()), (Verdict::Inconclusive, Verdict::Promote));
+        assert_eq!(outcomes(0, 0).verdict(), Verdict::Inconclusive);
     }
 
     #[test]
     fn one_failure_aborts_at_no_number_of_robots() {
-        assert!((1..100_000).all(|n| of(n, 1).verdict() != Verdict::Abort));
-        assert!((2..=10).all(|n| of(n, 2).verdict() == Verdict::Abort));
+        assert!((1..100_000).all(|n| outcomes(n, 1).verdict() != Verdict::Abort));
+        assert!((2..=10).all(|n| outcomes(n, 2).verdict() == Verdict::Abort));
     }
 
     /// Shares of releases that end aborted and promoted when each robot fails at `rate` and the test is looked at after each, worked out
@@ -129,7 +129,7 @@ mod tests {
             }
             open = Vec::new();
             for (failed, share) in (0u32..).zip(next).filter(|(_, share)| *share > 0.0) {
-                match of(n, failed).verdict() {
+                match outcomes(n, failed).verdict() {
                     Verdict::Abort => abort += share,
                     Verdict::Promote => promote += share,
                     Verdict::Inconclusive => open.push((failed, share)),
@@ -155,9 +155,9 @@ mod tests {
 
     #[test]
     fn the_evidence_says_everything_that_was_weighed() {
-        let early = of(3, 1).evidence();
+        let early = outcomes(3, 1).evidence();
         assert_eq!((early.verdict, early.false_abort_permille), (Verdict::Inconclusive, Some(59)));
-        let proven = of(12, 0).evidence();
+        let proven = outcomes(12, 0).evidence();
         assert_eq!((proven.verdict, proven.false_abort_permille), (Verdict::Promote, None));
         assert_eq!(proven.upper_bound_permille, 221);
         assert!(proven.log_ratio_micronats <= proven.promote_micronats);

@@ -46,7 +46,7 @@ pub struct Directory {
 impl Directory {
     /// Of these rows, without what is over at `now`. That is a moment without jumps of the wall ([`crate::time::Now::steady_wall`]): none of them gives a
     /// key back, or takes a token from streams that stand.
-    pub fn of<'a>(
+    pub fn from_rows<'a>(
         tokens: impl IntoIterator<Item = &'a TokenRecord>,
         robots: impl IntoIterator<Item = &'a RobotIdentity>,
         now: Utc,
@@ -162,7 +162,7 @@ mod tests {
             Deny { key: Digest([2; 32]), until_unix_ms: 3 * DAY_MS },
         ];
         let robot = RobotIdentity { denied, ..RobotIdentity::new(crate::ids::RobotId::parse("r7").expect("an id")) };
-        let directory = Directory::of(&tokens, [&robot], Utc(2 * DAY_MS));
+        let directory = Directory::from_rows(&tokens, [&robot], Utc(2 * DAY_MS));
         assert_eq!(directory.tokens.keys().map(TokenId::as_str).collect::<Vec<_>>(), ["t1"]);
         assert!(directory.denies(&Digest([2; 32])) && !directory.denies(&Digest([1; 32])));
         let text = serde_json::to_string(&directory).expect("text");
@@ -185,11 +185,11 @@ mod tests {
             rotation: None,
         };
         assert!(record.stands(Utc(999)) && !record.stands(Utc(1_000)));
-        let told = Directory::of([&record], [], Utc(0));
+        let told = Directory::from_rows([&record], [], Utc(0));
         let at = |ms: i64| told.holder(&id, &Digest([7; 32]), Utc(ms)).expect("known").is_expired();
         assert!(!at(999) && at(1_000));
         assert_eq!(told.holder(&id, &Digest([7; 32]), Utc(0)).expect("known").person(), "anna");
-        assert!(Directory::of([&record], [], Utc(1_000)).tokens.is_empty(), "whoever hears it knows it no more");
+        assert!(Directory::from_rows([&record], [], Utc(1_000)).tokens.is_empty(), "whoever hears it knows it no more");
     }
 
     #[test]

@@ -51,7 +51,7 @@ fn write_passed(view: &mut RolloutProjection, now: Now, first: usize, plan: &mut
     let passed = view.passed;
     if view.marks.get("ota").is_none_or(|m| m.row.seq < passed) {
         let mut tx = Tx::new(view, now, "ota");
-        tx.put(OtaMark { seq: passed }, "ota.passed");
+        tx.put_row(OtaMark { seq: passed }, "ota.passed");
         if let Some(item) = tx.finish() {
             plan.items.insert(first, item);
         }
@@ -171,8 +171,8 @@ fn write_time(view: &mut RolloutProjection, now: Now, plan: &mut Plan) {
     let site_ms = view.served_ms(&now);
     if site_ms >= clock.site_ms + 1_000 || clock == OtaClock::default() {
         plan.decide(view, now, "ota", |tx| {
-            tx.put(OtaClock { site_ms, ..clock }, "ota.served");
-            tx.put(OtaMark { seq: tx.view.absorbed }, "ota.consumed");
+            tx.put_row(OtaClock { site_ms, ..clock }, "ota.served");
+            tx.put_row(OtaMark { seq: tx.view.absorbed }, "ota.consumed");
         });
     }
 }

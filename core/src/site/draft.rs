@@ -81,7 +81,7 @@ impl Draft {
     /// Checks everything; `found` may already hold what the reader noted.
     pub fn build(self, mut found: Violations) -> Result<Site, Refusal> {
         let v = &mut found;
-        let site_id = v.take("site_id", SiteId::parse(&self.site_id));
+        let site_id = v.accept("site_id", SiteId::parse(&self.site_id));
         check_text(v, "name", &self.name, 200);
         check_text(v, "map_id", &self.map_id, 64);
         check_text(v, "map_version", &self.map_version, MAP_VERSION_BYTES);
@@ -174,7 +174,7 @@ fn check_speed(v: &mut Violations, field: &str, speed: Option<u32>) {
 fn build_areas(v: &mut Violations, drafts: Vec<DraftArea>) -> Vec<Area> {
     let mut areas: Vec<Area> = Vec::new();
     for draft in drafts {
-        let Some(area_id) = v.take(&format!("{}.id", draft.field), AreaId::parse(&draft.id)) else { continue };
+        let Some(area_id) = v.accept(&format!("{}.id", draft.field), AreaId::parse(&draft.id)) else { continue };
         if areas.iter().any(|a| a.area_id == area_id) {
             v.add(format!("{}.id", draft.field), format!("area {area_id} is there twice"));
             continue;
@@ -192,7 +192,7 @@ fn build_waypoints(v: &mut Violations, drafts: Vec<DraftWaypoint>, areas: &[Area
     let (mut waypoints, mut names, mut capacities) = (Vec::new(), Names::new(), Vec::new());
     for draft in drafts {
         let field = &draft.field;
-        let Some(waypoint_id) = v.take(&format!("{field}.id"), WaypointId::parse(&draft.id)) else { continue };
+        let Some(waypoint_id) = v.accept(&format!("{field}.id"), WaypointId::parse(&draft.id)) else { continue };
         if names.insert(waypoint_id.clone(), WaypointIx(waypoints.len() as u32)).is_some() {
             v.add(format!("{field}.id"), format!("waypoint {waypoint_id} is there twice"));
         }
@@ -268,7 +268,7 @@ fn build_passages(v: &mut Violations, drafts: Vec<DraftPassage>, names: &Names, 
     let mut places = Vec::new();
     for draft in drafts {
         let field = &draft.field;
-        let Some(place_id) = v.take(&format!("{field}.id"), PlaceId::parse(&draft.id)) else { continue };
+        let Some(place_id) = v.accept(&format!("{field}.id"), PlaceId::parse(&draft.id)) else { continue };
         if draft.capacity.is_some_and(|c| c == 0 || c > CAPACITY_MAX) {
             v.add(format!("{field}.capacity"), format!("must be 1..{CAPACITY_MAX}"));
         }
@@ -306,7 +306,7 @@ fn build_passages(v: &mut Violations, drafts: Vec<DraftPassage>, names: &Names, 
 fn add_standing_places(v: &mut Violations, site: &mut Site, capacities: &[u32]) {
     for (at, capacity) in capacities.iter().enumerate().filter(|(_, c)| **c > 0) {
         let name = site.waypoints[at].waypoint_id.as_str();
-        let Some(place_id) = v.take("waypoint.id", PlaceId::parse(name)) else { continue };
+        let Some(place_id) = v.accept("waypoint.id", PlaceId::parse(name)) else { continue };
         site.waypoints[at].standing = Some(PlaceIx(site.places.len() as u32));
         let kind = PlaceKind::Standing(WaypointIx(at as u32));
         site.places.push(Place { place_id, kind, capacity: *capacity });
@@ -322,7 +322,7 @@ fn add_standing_places(v: &mut Violations, site: &mut Site, capacities: &[u32]) 
 pub(super) fn add_starts(v: &mut Violations, site: &mut Site, robots: Vec<DraftRobot>) {
     check_count(v, "robot", robots.len(), 0, SITE_ROBOTS_MAX);
     for DraftRobot { field, id, at } in robots {
-        let Some(robot_id) = v.take(&format!("{field}.id"), RobotId::parse(&id)) else { continue };
+        let Some(robot_id) = v.accept(&format!("{field}.id"), RobotId::parse(&id)) else { continue };
         let Some(waypoint) = find(v, &format!("{field}.at"), &site.waypoint_names, &at) else { continue };
         if site.starts.insert(robot_id.clone(), waypoint).is_some() {
             v.add(format!("{field}.id"), format!("robot {robot_id} is there twice"));

@@ -78,13 +78,13 @@ mod tests {
     use super::*;
 
     /// One look that takes its whole second.
-    fn look(at_ms: u64, answer: Answer) -> Look {
+    fn look_at(at_ms: u64, answer: Answer) -> Look {
         Look { due: LinkTime(at_ms), begun: LinkTime(at_ms), ended: LinkTime(at_ms + 1_000), answer }
     }
 
     /// Verdicts of looks in vain, one after the other from a moment on.
     fn in_vain(hung: &mut Hung, from_ms: u64, looks: u64) -> Vec<Verdict> {
-        (0..looks).map(|n| hung.saw(look(from_ms + n * 1_000, Answer::None))).collect()
+        (0..looks).map(|n| hung.saw(look_at(from_ms + n * 1_000, Answer::None))).collect()
     }
 
     #[test]
@@ -92,7 +92,7 @@ mod tests {
         use Verdict::{Kill, Leave};
         let mut hung = Hung::default();
         assert_eq!(in_vain(&mut hung, 0, 2), [Leave, Leave]);
-        assert_eq!(hung.saw(look(2_000, Answer::Heard)), Leave);
+        assert_eq!(hung.saw(look_at(2_000, Answer::Heard)), Leave);
         assert_eq!(in_vain(&mut hung, 3_000, 3), [Leave, Leave, Kill]);
     }
 
@@ -101,8 +101,8 @@ mod tests {
         use Verdict::{Kill, Leave};
         let late = limits::STOP_LOOK_LATE.as_ms() + 1;
         let began_late =
-            |at| Look { begun: LinkTime(at + late), ended: LinkTime(at + late + 1_000), ..look(at, Answer::None) };
-        let ended_late = |at| Look { ended: LinkTime(at + 1_000 + late), ..look(at, Answer::None) };
+            |at| Look { begun: LinkTime(at + late), ended: LinkTime(at + late + 1_000), ..look_at(at, Answer::None) };
+        let ended_late = |at| Look { ended: LinkTime(at + 1_000 + late), ..look_at(at, Answer::None) };
         for late in [began_late(2_000), ended_late(2_000)] {
             let mut hung = Hung::default();
             assert_eq!(in_vain(&mut hung, 0, 2), [Leave, Leave]);
@@ -118,8 +118,8 @@ mod tests {
         assert_eq!(in_vain(&mut hung, 0, 3), [Leave, Leave, Kill]);
         assert_eq!(in_vain(&mut hung, 3_000, 4), [Leave, Leave, Tell, Tell]);
         // Ended at 3 s.
-        assert_eq!(hung.saw(look(31_999, Answer::None)), Tell);
-        assert_eq!(hung.saw(look(32_000, Answer::None)), Kill);
+        assert_eq!(hung.saw(look_at(31_999, Answer::None)), Tell);
+        assert_eq!(hung.saw(look_at(32_000, Answer::None)), Kill);
         assert_eq!(in_vain(&mut hung, 33_000, 3), [Leave, Leave, Tell]);
     }
 }

@@ -67,7 +67,7 @@ impl Ladder {
     }
 
     /// How far it is at `now`.
-    pub fn look(&mut self, now: LinkTime, around: Around) -> Stage {
+    pub fn advance(&mut self, now: LinkTime, around: Around) -> Stage {
         let silence = now.since(self.fed);
         let (slow, stand) = around.patience();
         let due = match silence {
@@ -110,7 +110,7 @@ mod tests {
     fn at_ease() -> Ladder {
         let mut ladder = Ladder::begin(LinkTime(0));
         heard(&mut ladder, 1..4);
-        assert_eq!(ladder.look(LinkTime(3_000), Around::People), Stage::Heard);
+        assert_eq!(ladder.advance(LinkTime(3_000), Around::People), Stage::Heard);
         ladder
     }
 
@@ -118,9 +118,9 @@ mod tests {
     fn a_robot_that_begins_stands_until_it_was_answered_three_times() {
         let mut ladder = Ladder::begin(LinkTime(0));
         heard(&mut ladder, 1..3);
-        assert_eq!(ladder.look(LinkTime(2_500), Around::Robots), Stage::Stand);
+        assert_eq!(ladder.advance(LinkTime(2_500), Around::Robots), Stage::Stand);
         heard(&mut ladder, 3..4);
-        assert_eq!(ladder.look(LinkTime(3_500), Around::Robots), Stage::Heard);
+        assert_eq!(ladder.advance(LinkTime(3_500), Around::Robots), Stage::Heard);
     }
 
     #[test]
@@ -130,28 +130,28 @@ mod tests {
             for (at, stage) in
                 [(slow - 1, Stage::Heard), (slow, Stage::Slow), (stand - 1, Stage::Slow), (stand, Stage::Stand)]
             {
-                assert_eq!(ladder.look(LinkTime(at), around), stage, "{around:?} at {at}");
+                assert_eq!(ladder.advance(LinkTime(at), around), stage, "{around:?} at {at}");
             }
         }
     }
 
     #[test]
     fn twenty_seconds_of_silence_stand_among_people_and_only_slow_elsewhere() {
-        assert_eq!(at_ease().look(LinkTime(23_000), Around::Robots), Stage::Slow);
-        assert_eq!(at_ease().look(LinkTime(23_000), Around::People), Stage::Stand);
+        assert_eq!(at_ease().advance(LinkTime(23_000), Around::Robots), Stage::Slow);
+        assert_eq!(at_ease().advance(LinkTime(23_000), Around::People), Stage::Stand);
     }
 
     #[test]
     fn it_ends_after_three_good_check_ins_that_were_sent_since_it_rose() {
         let mut ladder = at_ease();
-        assert_eq!(ladder.look(LinkTime(33_000), Around::Robots), Stage::Stand);
+        assert_eq!(ladder.advance(LinkTime(33_000), Around::Robots), Stage::Stand);
         // Answers that lay in a buffer are to check-ins of before.
         heard(&mut ladder, 4..33);
-        assert_eq!(ladder.look(LinkTime(33_100), Around::Robots), Stage::Stand);
+        assert_eq!(ladder.advance(LinkTime(33_100), Around::Robots), Stage::Stand);
         heard(&mut ladder, 34..36);
-        assert_eq!(ladder.look(LinkTime(35_100), Around::Robots), Stage::Stand);
+        assert_eq!(ladder.advance(LinkTime(35_100), Around::Robots), Stage::Stand);
         heard(&mut ladder, 36..37);
-        assert_eq!(ladder.look(LinkTime(36_100), Around::Robots), Stage::Heard);
+        assert_eq!(ladder.advance(LinkTime(36_100), Around::Robots), Stage::Heard);
     }
 
     #[test]
@@ -164,13 +164,13 @@ mod tests {
     #[test]
     fn good_check_ins_count_from_new_after_another_silence() {
         let mut ladder = at_ease();
-        ladder.look(LinkTime(33_000), Around::Robots);
+        ladder.advance(LinkTime(33_000), Around::Robots);
         heard(&mut ladder, 34..36);
-        ladder.look(LinkTime(35_000), Around::Robots);
-        ladder.look(LinkTime(46_000), Around::Robots);
+        ladder.advance(LinkTime(35_000), Around::Robots);
+        ladder.advance(LinkTime(46_000), Around::Robots);
         heard(&mut ladder, 46..48);
-        assert_eq!(ladder.look(LinkTime(47_000), Around::Robots), Stage::Stand);
+        assert_eq!(ladder.advance(LinkTime(47_000), Around::Robots), Stage::Stand);
         heard(&mut ladder, 48..49);
-        assert_eq!(ladder.look(LinkTime(48_000), Around::Robots), Stage::Heard);
+        assert_eq!(ladder.advance(LinkTime(48_000), Around::Robots), Stage::Heard);
     }
 }

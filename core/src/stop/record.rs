@@ -105,7 +105,7 @@ fn write(record: &StopRecord, expect: Expect) -> Item {
         Scope::Fleet => note,
     };
     let mut item = Item::new(Writer::Stop, actor);
-    item.put(record, expect, fact).audit(note);
+    item.put_row(record, expect, fact).audit(note);
     item
 }
 

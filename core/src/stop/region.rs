@@ -23,7 +23,7 @@ pub struct Bounds {
 }
 
 impl Bounds {
-    fn of(a: (i64, i64), b: (i64, i64)) -> Self {
+    fn between(a: (i64, i64), b: (i64, i64)) -> Self {
         let mm = |v: i64| i32::try_from(v).unwrap_or(if v < 0 { i32::MIN } else { i32::MAX });
         Self { x0_mm: mm(a.0.min(b.0)), y0_mm: mm(a.1.min(b.1)), x1_mm: mm(a.0.max(b.0)), y1_mm: mm(a.1.max(b.1)) }
     }
@@ -74,7 +74,7 @@ impl Region {
 
     /// One box.
     pub fn of_box(x0_mm: i32, y0_mm: i32, x1_mm: i32, y1_mm: i32) -> Self {
-        Self::new([Bounds::of((x0_mm.into(), y0_mm.into()), (x1_mm.into(), y1_mm.into()))])
+        Self::new([Bounds::between((x0_mm.into(), y0_mm.into()), (x1_mm.into(), y1_mm.into()))])
     }
 
     /// These boxes; if they are too many, fewer that hold them all.
@@ -111,7 +111,7 @@ impl Region {
 
 fn between(site: &Site, a: WaypointIx, b: WaypointIx) -> Bounds {
     let at = |w: WaypointIx| (site.waypoint(w).x_mm, site.waypoint(w).y_mm);
-    Bounds::of(at(a), at(b))
+    Bounds::between(at(a), at(b))
 }
 
 #[cfg(test)]

@@ -131,9 +131,9 @@ impl RobotStop {
     }
 
     /// What to do at `now`, standing or driving at `pose`.
-    pub fn look(&mut self, now: &Now, pose: Option<&Pose>, around: Around) -> Obeyed {
+    pub fn advance(&mut self, now: &Now, pose: Option<&Pose>, around: Around) -> Obeyed {
         let mut is_changed = self.kept.latch.forget(now.wall, limits::RESETS_MAX);
-        let stage = self.ladder.look(now.link, around);
+        let stage = self.ladder.advance(now.link, around);
         self.was_heard |= stage < Stage::Stand;
         let mut over: Vec<(StopId, StopLevel)> =
             self.kept.latch.over(&self.robot_id, pose).map(|stop| (stop.stop_id.clone(), stop.level)).collect();
@@ -211,18 +211,18 @@ mod tests {
         let mut robot = RobotStop::begin(robot(), Kept::default(), LinkTime(0));
         robot.told_all(Latch::default());
         (1..4).for_each(|s| robot.answered(LinkTime(s * 1000)));
-        assert_eq!(robot.look(&at(3_000), None, Around::People).level, StopLevel::None);
+        assert_eq!(robot.advance(&at(3_000), None, Around::People).level, StopLevel::None);
         robot
     }
 
     #[test]
     fn a_robot_begins_stopped_until_it_was_told_and_answered() {
         let mut robot = RobotStop::begin(robot(), Kept::default(), LinkTime(0));
-        assert_eq!(robot.look(&at(0), None, Around::Robots).level, StopLevel::Halt);
+        assert_eq!(robot.advance(&at(0), None, Around::Robots).level, StopLevel::Halt);
         (1..4).for_each(|s| robot.answered(LinkTime(s * 1000)));
-        assert_eq!(robot.look(&at(3_000), None, Around::Robots).level, StopLevel::Halt, "answered, and not told");
+        assert_eq!(robot.advance(&at(3_000), None, Around::Robots).level, StopLevel::Halt, "answered, and not told");
         robot.told_all(Latch::default());
-        assert_eq!(robot.look(&at(3_000), None, Around::Robots).level, StopLevel::None);
+        assert_eq!(robot.advance(&at(3_000), None, Around::Robots).level, StopLevel::None);
         assert!(robot.kept().awaiting.is_empty(), "a start is no stop");
     }
 
@@ -231,10 +231,10 @@ mod tests {
         let mut robot = RobotStop::begin(robot(), Kept::default(), LinkTime(0));
         robot.told_all(Latch::default());
         for ms in [0, 5_000, 60_000] {
-            assert_eq!(robot.look(&at(ms), None, Around::People).level, StopLevel::Halt);
+            assert_eq!(robot.advance(&at(ms), None, Around::People).level, StopLevel::Halt);
         }
         (60..63).for_each(|s| robot.answered(LinkTime(s * 1000)));
-        assert_eq!(robot.look(&at(62_500), None, Around::People).level, StopLevel::None);
+        assert_eq!(robot.advance(&at(62_500), None, Around::People).level, StopLevel::None);
         assert!(robot.kept().awaiting.is_empty());
     }
 
@@ -243,7 +243,7 @@ mod tests {
         let mut robot = free();
         assert!(robot.told_beside(vec![stop(1, StopLevel::Halt)], vec![], |_| true));
         assert!(!robot.told_beside(vec![stop(1, StopLevel::Halt)], vec![], |_| true), "twice is once");
-        assert_eq!(robot.look(&at(3_100), None, Around::Robots).level, StopLevel::Halt);
+        assert_eq!(robot.advance(&at(3_100), None, Around::Robots).level, StopLevel::Halt);
         let older = Reset { at: Utc(0), ..reset(1) };
         assert!(!robot.told_beside(vec![], vec![reset(1)], |_| false), "not marked");
         assert!(!robot.told_beside(vec![], vec![older], |_| true), "older than its stop");
@@ -251,7 +251,7 @@ mod tests {
         assert!(robot.kept().latch.is_effective(&id(1)));
         assert!(robot.told_beside(vec![], vec![Reset { proof: vec![1], ..reset(1) }], |_| true));
         assert_eq!(robot.kept().latch.reset_of(&id(1)), Some(&reset(1)), "its mark is not kept");
-        assert_eq!(robot.look(&at(3_200), None, Around::Robots).level, StopLevel::Halt, "it waits for a person");
+        assert_eq!(robot.advance(&at(3_200), None, Around::Robots).level, StopLevel::Halt, "it waits for a person");
     }
 
     #[test]
@@ -264,7 +264,7 @@ mod tests {
         let (last, posture) = (StopId::parse("STOP-Z").expect("an id"), StopLevel::ControlledStopPosture);
         let halts = [stop(9, StopLevel::Halt), Stop { stop_id: last.clone(), ..stop(0, posture) }];
         robot.told(slow.chain(halts).collect(), vec![]);
-        let obeyed = robot.look(&at(3_100), None, Around::Robots);
+        let obeyed = robot.advance(&at(3_100), None, Around::Robots);
         assert_eq!((obeyed.level, obeyed.inside.len()), (posture, limits::STOPS_MAX + 2));
         assert_eq!(obeyed.inside[..2], [last, id(9)]);
     }
@@ -273,31 +273,31 @@ mod tests {
     fn slow_ends_with_its_reset_and_asks_for_no_resume() {
         let mut robot = free();
         robot.told(vec![stop(1, StopLevel::Slow)], vec![]);
-        assert_eq!(robot.look(&at(3_100), None, Around::Robots).level, StopLevel::Slow);
+        assert_eq!(robot.advance(&at(3_100), None, Around::Robots).level, StopLevel::Slow);
         robot.told(vec![], vec![reset(1)]);
-        assert_eq!(robot.look(&at(3_200), None, Around::Robots).level, StopLevel::None);
+        assert_eq!(robot.advance(&at(3_200), None, Around::Robots).level, StopLevel::None);
     }
 
     #[test]
     fn a_silence_among_people_waits_for_a_resume_and_elsewhere_it_does_not() {
         for (around, level) in [(Around::People, StopLevel::Halt), (Around::Robots, StopLevel::None)] {
             let mut robot = free();
-            assert_eq!(robot.look(&at(60_000), None, around).level, StopLevel::ControlledStopPosture);
+            assert_eq!(robot.advance(&at(60_000), None, around).level, StopLevel::ControlledStopPosture);
             (60..63).for_each(|s| robot.answered(LinkTime(s * 1000)));
-            assert_eq!(robot.look(&at(62_000), None, around).level, level, "{around:?}");
+            assert_eq!(robot.advance(&at(62_000), None, around).level, level, "{around:?}");
             let silences = robot.kept().awaiting.clone();
             assert_eq!(silences.len(), usize::from(around == Around::People));
             assert!(silences.iter().all(is_silence) && !is_silence(&id(1)));
             robot.resumed(&silences);
-            assert_eq!(robot.look(&at(62_100), None, around).level, StopLevel::None);
+            assert_eq!(robot.advance(&at(62_100), None, around).level, StopLevel::None);
         }
     }
 
     /// It is silent for so long, and answered again.
     fn silence(robot: &mut RobotStop, at_s: u64) {
-        robot.look(&at(at_s * 1_000), None, Around::People);
+        robot.advance(&at(at_s * 1_000), None, Around::People);
         (at_s..at_s + 3).for_each(|s| robot.answered(LinkTime(s * 1_000)));
-        robot.look(&at(at_s * 1_000 + 2_500), None, Around::People);
+        robot.advance(&at(at_s * 1_000 + 2_500), None, Around::People);
     }
 
     #[test]
@@ -308,20 +308,20 @@ mod tests {
         (2..20).for_each(|n| silence(&mut robot, n * 60));
         assert_eq!((first.len(), &robot.kept().awaiting), (1, &first));
         robot.resumed(&first);
-        assert_eq!(robot.look(&at(1_200_000 - 57_000), None, Around::People).level, StopLevel::None);
+        assert_eq!(robot.advance(&at(1_200_000 - 57_000), None, Around::People).level, StopLevel::None);
         silence(&mut robot, 1_200);
         let second = robot.kept().awaiting.clone();
         assert!(second.len() == 1 && second.is_disjoint(&first), "{second:?}");
         // The first is resumed while the next one goes on: nobody has seen that one.
         let mut robot = free();
         silence(&mut robot, 60);
-        robot.look(&at(120_000), None, Around::People);
+        robot.advance(&at(120_000), None, Around::People);
         robot.resumed(&first);
-        robot.look(&at(120_100), None, Around::People);
+        robot.advance(&at(120_100), None, Around::People);
         let next = robot.kept().awaiting.clone();
         assert!(next.len() == 1 && next.is_disjoint(&first), "{next:?}");
         robot.resumed(&next);
-        robot.look(&at(120_200), None, Around::People);
+        robot.advance(&at(120_200), None, Around::People);
         assert!(robot.kept().awaiting.is_empty(), "a person saw that one");
     }
 
@@ -331,15 +331,15 @@ mod tests {
         let kept = Kept { awaiting: silences.collect(), ..Kept::default() };
         let mut full_of_silences = RobotStop::begin(robot(), kept, LinkTime(0));
         full_of_silences.told(vec![stop(1, StopLevel::Halt)], vec![]);
-        let obeyed = full_of_silences.look(&at(100), None, Around::Robots);
+        let obeyed = full_of_silences.advance(&at(100), None, Around::Robots);
         assert_eq!((obeyed.inside, full_of_silences.awaiting(limits::STOPS_MAX)[0].clone()), (vec![id(1)], id(1)));
         let mut full_of_stops = free();
         let named = |n: usize| StopId::parse(&format!("STOP-A{n}")).expect("an id");
         let many = (0..2 * limits::STOPS_MAX).map(|n| Stop { stop_id: named(n), ..stop(0, StopLevel::Halt) });
         full_of_stops.told(many.collect(), vec![]);
-        full_of_stops.look(&at(3_100), None, Around::Robots);
+        full_of_stops.advance(&at(3_100), None, Around::Robots);
         full_of_stops.told(vec![stop(2, StopLevel::ControlledStopPosture)], vec![]);
-        let obeyed = full_of_stops.look(&at(3_200), None, Around::Robots);
+        let obeyed = full_of_stops.advance(&at(3_200), None, Around::Robots);
         assert_eq!((obeyed.level, &obeyed.inside[0]), (StopLevel::ControlledStopPosture, &id(2)));
         assert!(full_of_stops.kept().awaiting.contains(&id(2)));
     }
@@ -348,12 +348,12 @@ mod tests {
     fn a_resume_that_overtakes_the_reset_waits_for_it() {
         let mut robot = free();
         robot.told(vec![stop(1, StopLevel::Halt)], vec![]);
-        robot.look(&at(3_100), None, Around::Robots);
+        robot.advance(&at(3_100), None, Around::Robots);
         assert!(!robot.resumed(&[id(1)].into()));
         robot.told(vec![], vec![reset(1)]);
-        assert_eq!(robot.look(&at(3_200), None, Around::Robots).level, StopLevel::Halt);
+        assert_eq!(robot.advance(&at(3_200), None, Around::Robots).level, StopLevel::Halt);
         assert!(robot.resumed(&[id(1)].into()));
-        assert_eq!(robot.look(&at(3_300), None, Around::Robots).level, StopLevel::None);
+        assert_eq!(robot.advance(&at(3_300), None, Around::Robots).level, StopLevel::None);
     }
 
     /// What may happen to a robot, at any time and in any order.
@@ -431,7 +431,7 @@ mod tests {
                     next.robot = RobotStop::begin(robot(), kept, LinkTime(self.link_ms));
                 }
             }
-            let obeyed = next.robot.look(&Now { wall, ..at(next.link_ms) }, None, next.around);
+            let obeyed = next.robot.advance(&Now { wall, ..at(next.link_ms) }, None, next.around);
             (next.level, next.stage) = (obeyed.level, obeyed.stage);
             for (n, fact) in [1, 2].into_iter().zip(&mut next.facts) {
                 fact.0 |= next.robot.kept().awaiting.contains(&id(n));

@@ -138,19 +138,27 @@ mod tests {
         RobotId::parse(id).expect("an id")
     }
 
-    fn of(level: StopLevel, heard: Heard) -> Confirmation {
+    fn confirm_heard(level: StopLevel, heard: Heard) -> Confirmation {
         confirmation(&stop(level), 7, &robot("r1"), Some(&heard), LinkTime(10_500))
     }
 
     #[test]
     fn only_a_robot_that_says_it_stands_and_obeys_is_shown_as_standing() {
         let halt = StopLevel::Halt;
-        assert_eq!(of(halt, standing()), Confirmation::StandstillConfirmed);
-        assert_eq!(of(halt, Heard { is_still: false, ..standing() }), Confirmation::Acked);
-        assert_eq!(of(StopLevel::ControlledStopPosture, standing()), Confirmation::Acked, "not yet in its posture");
-        assert_eq!(of(halt, Heard { level: StopLevel::Slow, ..standing() }), Confirmation::Acked);
-        assert_eq!(of(halt, Heard { generation: 6, ..standing() }), Confirmation::Requested);
-        assert_eq!(of(StopLevel::Slow, standing()), Confirmation::Acked, "standing is not what was asked for");
+        assert_eq!(confirm_heard(halt, standing()), Confirmation::StandstillConfirmed);
+        assert_eq!(confirm_heard(halt, Heard { is_still: false, ..standing() }), Confirmation::Acked);
+        assert_eq!(
+            confirm_heard(StopLevel::ControlledStopPosture, standing()),
+            Confirmation::Acked,
+            "not yet in its posture"
+        );
+        assert_eq!(confirm_heard(halt, Heard { level: StopLevel::Slow, ..standing() }), Confirmation::Acked);
+        assert_eq!(confirm_heard(halt, Heard { generation: 6, ..standing() }), Confirmation::Requested);
+        assert_eq!(
+            confirm_heard(StopLevel::Slow, standing()),
+            Confirmation::Acked,
+            "standing is not what was asked for"
+        );
     }
 
     #[test]

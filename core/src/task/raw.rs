@@ -134,7 +134,7 @@ impl RawTask {
         }
         let robot_id = match self.robot_id.as_str() {
             "" => None,
-            text => bad.take(&format!("{field}.robot_id"), RobotId::parse(text)),
+            text => bad.accept(&format!("{field}.robot_id"), RobotId::parse(text)),
         };
         let timeout_ms = self.check_times(field, &mut bad);
         let selector = self.check_selector(field, &mut bad);
@@ -231,7 +231,7 @@ impl RawTask {
         let mut ids = Vec::new();
         for (i, text) in self.depends_on.iter().enumerate() {
             let at = format!("{field}.depends_on[{i}]");
-            if let Some(id) = bad.take(&at, TaskId::parse(text)) {
+            if let Some(id) = bad.accept(&at, TaskId::parse(text)) {
                 if !seen.insert(id.clone()) {
                     bad.add(at, "stands there twice");
                 }
@@ -306,7 +306,7 @@ fn check_step(step: &RawStep, at: &str, knows: &dyn Fn(&WaypointId) -> bool, bad
             return None;
         }
         Some(RawStepKind::Goto(name)) => {
-            let waypoint = bad.take(&format!("{at}.goto.waypoint"), WaypointId::parse(name))?;
+            let waypoint = bad.accept(&format!("{at}.goto.waypoint"), WaypointId::parse(name))?;
             if !knows(&waypoint) {
                 bad.add(format!("{at}.goto.waypoint"), format!("the site has no waypoint {waypoint}"));
             }

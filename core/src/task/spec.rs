@@ -121,7 +121,7 @@ impl Class {
         }
     }
     /// The class of a priority, so many classes up.
-    pub fn of(priority: u8, promotions: u64) -> Self {
+    pub fn from_priority(priority: u8, promotions: u64) -> Self {
         let own = match priority {
             0..=1 => Self::Urgent,
             2..=6 => Self::Normal,
@@ -172,7 +172,7 @@ mod tests {
 
     #[test]
     fn each_promotion_lifts_by_one_class_up_to_urgent() {
-        assert_eq!([0, 1, 2].map(|n| Class::of(5, n)), [Class::Normal, Class::Urgent, Class::Urgent]);
-        assert_eq!([0, 1, 2].map(|n| Class::of(9, n)), [Class::Background, Class::Normal, Class::Urgent]);
+        assert_eq!([0, 1, 2].map(|n| Class::from_priority(5, n)), [Class::Normal, Class::Urgent, Class::Urgent]);
+        assert_eq!([0, 1, 2].map(|n| Class::from_priority(9, n)), [Class::Background, Class::Normal, Class::Urgent]);
     }
 }

@@ -23,7 +23,7 @@ impl Folder {
         let waiting = self.waiting_root()?;
         let mut draft = match &waiting {
             Some(waiting) => waiting.draft.clone(),
-            None => RootDraft { version: newest + 1, ..RootDraft::of(&root)? },
+            None => RootDraft { version: newest + 1, ..RootDraft::from_root(&root)? },
         };
         draft.expires = now.plus_ms(PEOPLE_LIFE_MS);
         change.map_or(Ok(()), |change| draft.change(change))?;
@@ -38,7 +38,7 @@ impl Folder {
     pub fn waiting_root(&self) -> Result<Option<WaitingRoot>, Error> {
         let Some(document) = self.document(PENDING)? else { return Ok(None) };
         let (newest, root) = self.root()?;
-        let draft = RootDraft::of(&document)?;
+        let draft = RootDraft::from_root(&document)?;
         must_be_next("root", draft.version, newest + 1)?;
         let (signed_by, lacks) = Asked::for_root(&root, &document)?.standing(&document)?;
         let lack = |group: usize| lacks.get(group).copied().unwrap_or_default();
@@ -58,7 +58,7 @@ impl Folder {
             let text = "no root waits for signatures: bundle root rotate or add-key makes one";
             return Err(Refusal::field("repository", text).into());
         };
-        let version = RootDraft::of(&document)?.version;
+        let version = RootDraft::from_root(&document)?.version;
         must_be_next("root", version, newest + 1)?;
         let asked = Asked::for_root(&before, &document)?;
         asked.must_name(keys)?;

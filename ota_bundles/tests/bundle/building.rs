@@ -55,7 +55,7 @@ fn a_bundle_is_built_whole_and_holds_what_its_manifest_says() {
     assert_eq!(bytes, 300_005);
     assert_eq!((built.length(), built.needs()), (300_005, Needs::Park));
     assert_eq!(built.hardware().into_iter().collect::<Vec<_>>(), ["h2"], "models that run all of it");
-    assert_eq!(built.components[0].digest, Digest::of(b"walks"));
+    assert_eq!(built.components[0].digest, Digest::of_content(b"walks"));
     assert_eq!(built.hard_stop_codes.iter().copied().collect::<Vec<_>>(), [1999, 2001]);
     let mut names: Vec<_> = fs::read_dir(&out)
         .expect("there")

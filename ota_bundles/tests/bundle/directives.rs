@@ -18,7 +18,7 @@ pub fn directive() -> Directive {
         robot_id: robot("rbt-01"),
         key_id: key(7).public().id(),
         generation: 5,
-        manifest: Digest::of(b"manifest"),
+        manifest: Digest::of_content(b"manifest"),
         manifest_length: 8,
         rollback_floor: 2,
         issued_at: START,

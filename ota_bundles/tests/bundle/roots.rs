@@ -90,7 +90,7 @@ fn a_signature_that_is_not_asked_for_or_does_not_hold_is_refused_at_once_and_not
     ben.draft_root(None, START).expect("another draft");
     ben.sign_root(&[&project.key("root-2.pem")], &[]).expect("signed");
     let before = waits(&ann);
-    let draft = RootDraft::of(&before).expect("a root");
+    let draft = RootDraft::from_root(&before).expect("a root");
     let foreign = project.key("targets-1.pem");
     let by_foreign = sign_root(&draft, &[&project.key("root-2.pem"), &foreign]).expect("signed");
     let torn = sign_root(&draft, &[&project.key("root-2.pem")]).expect("signed");

@@ -35,7 +35,7 @@ pub fn robot() -> Fit {
 }
 
 pub fn onto(base: &SetManifest, components: Vec<Component>, robot: &Fit) -> Result<SetManifest, Vec<&'static str>> {
-    let fitted = base.with(Digest::of(b"walk"), &bundle(components), robot);
+    let fitted = base.with(Digest::of_content(b"walk"), &bundle(components), robot);
     fitted.map_err(|unfit| unfit.iter().map(midshift_bundle::set::Unfit::code).collect())
 }
 

@@ -25,7 +25,7 @@ pub fn signers(seeds: &[u8], threshold: u64) -> Signers {
 }
 
 pub fn target(name: &str, content: &[u8]) -> FileTarget {
-    FileTarget { name: name.to_owned(), digest: Digest::of(content), length: content.len() as u64 }
+    FileTarget { name: name.to_owned(), digest: Digest::of_content(content), length: content.len() as u64 }
 }
 
 /// Documents by name.

@@ -14,7 +14,7 @@ use std::sync::Arc;
 /// The real rule refuses the envelope for this reason, and the naive one takes it.
 fn is_taken_only_by(bug: SeededBug, envelope: &[u8], now: Utc, why: Rejection) {
     assert_eq!(open_naively(envelope, 4, now, Bugs::default()), Err(why));
-    assert!(open_naively(envelope, 4, now, Bugs::of(&[bug])).is_ok(), "{bug:?}");
+    assert!(open_naively(envelope, 4, now, Bugs::seeded(&[bug])).is_ok(), "{bug:?}");
 }
 
 #[test]
@@ -47,7 +47,7 @@ fn a_component_below_the_floor_fits_nobody_and_where_the_floor_is_forgotten_it_d
     let onto =
         |bugs| sets::onto(&SetManifest::default(), vec![sets::gait("0.9.0")], &Fit { floor: 4, bugs, ..sets::robot() });
     assert_eq!(onto(Bugs::default()), Err(vec!["BELOW_FLOOR"]));
-    assert!(onto(Bugs::of(&[SeededBug::FloorIsForgotten])).is_ok());
+    assert!(onto(Bugs::seeded(&[SeededBug::FloorIsForgotten])).is_ok());
 }
 
 #[tokio::test]
@@ -55,7 +55,7 @@ async fn a_frozen_repository_is_noticed_and_where_repositories_live_for_ever_it_
     let shelf = Shelf::new();
     let late = Reading { utc: shelf.now.plus_ms(2 * DAY_MS), is_synced: true };
     let is_believed = async |bugs: &[SeededBug]| {
-        let robot = shelf.robot().with(Bugs::of(bugs));
+        let robot = shelf.robot().with(Bugs::seeded(bugs));
         robot.refresh(Arc::new(shelf.documents.clone()), late).await.is_ok()
     };
     assert!(!is_believed(&[]).await);

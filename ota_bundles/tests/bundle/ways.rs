@@ -65,10 +65,10 @@ impl Shop {
     }
     /// Versions from which a patch to this one is listed, and whether the whole of it is.
     fn ways(&self, to: u64) -> (Vec<u64>, bool) {
-        let to = Digest::of(&program(to));
+        let to = Digest::of_content(&program(to));
         let files = self.listed();
         let has = |way: Way| files.iter().any(|file| file.name == way.target());
-        let bases = (0..9).filter(|from| has(Way { to, from: Some(Digest::of(&program(*from))) })).collect();
+        let bases = (0..9).filter(|from| has(Way { to, from: Some(Digest::of_content(&program(*from))) })).collect();
         (bases, has(Way { to, from: None }))
     }
 }
@@ -94,14 +94,14 @@ fn a_patch_leads_to_the_file_and_is_shorter_than_the_whole() {
     shop.sign(0, &[]).expect("signed");
     shop.sign(1, &[]).expect("signed");
     let [old, new] = [0, 1].map(program);
-    let (files, to) = (shop.listed(), Digest::of(&new));
+    let (files, to) = (shop.listed(), Digest::of_content(&new));
     let listed = |from| files.iter().find(|file| file.name == Way { to, from }.target()).expect("listed");
-    let (patch, whole) = (listed(Some(Digest::of(&old))), listed(None));
+    let (patch, whole) = (listed(Some(Digest::of_content(&old))), listed(None));
     assert!(patch.length < whole.length && whole.length < new.len() as u64);
     let bytes = fs::read(shop.folder.file(&patch.name, patch.digest)).expect("there");
     let (mut out, mut base) = (Vec::new(), Cursor::new(&old));
     decode(Some(&mut base as &mut dyn Base), &mut &*bytes, new.len() as u64, &mut out).expect("a patch");
-    assert_eq!(Digest::of(&out), to);
+    assert_eq!(Digest::of_content(&out), to);
 }
 
 #[test]
@@ -134,7 +134,7 @@ fn ways_go_with_the_file_that_they_lead_to() {
 
 #[test]
 fn only_two_digests_name_a_way() {
-    let [to, from] = [b"to".as_slice(), b"from"].map(Digest::of);
+    let [to, from] = [b"to".as_slice(), b"from"].map(Digest::of_content);
     for way in [Way { to, from: Some(from) }, Way { to, from: None }] {
         assert_eq!(Way::of_target(&way.target()), Some(way));
     }

@@ -26,7 +26,7 @@ fn forged(document: &[u8], by: &SecretKey, change: impl FnOnce(&mut Value)) -> V
 }
 
 fn meta(document: &[u8], version: u64) -> Value {
-    json!({"length": document.len(), "hashes": {"sha256": Digest::of(document).to_string()}, "version": version})
+    json!({"length": document.len(), "hashes": {"sha256": Digest::of_content(document).to_string()}, "version": version})
 }
 
 /// Seed of a key of no role.
@@ -315,5 +315,5 @@ async fn steps_5_6_6_and_5_7_what_is_listed_is_known_by_length_and_digest_and_no
     let listed = believed(&shelf, &robot).await.targets;
     assert_eq!(listed.keys().collect::<Vec<_>>(), ["walk-1.0.0.manifest", "walk-1.1.0.manifest"]);
     let two = &listed["walk-1.1.0.manifest"];
-    assert_eq!((two.digest, two.length), (Digest::of(b"two"), 3));
+    assert_eq!((two.digest, two.length), (Digest::of_content(b"two"), 3));
 }

@@ -320,7 +320,7 @@ impl Sets for DiskSets {
     fn read(&mut self, digest: &Digest, most: u64) -> Result<Vec<u8>, Error> {
         let bytes = optional(read_limited(&self.content(digest), most)).map_err(io_error("reading content"))?;
         let bytes = bytes.ok_or(Error::Missing(*digest))?;
-        if Digest::of(&bytes) == *digest { Ok(bytes) } else { Err(Error::Corrupt { digest: *digest }) }
+        if Digest::of_content(&bytes) == *digest { Ok(bytes) } else { Err(Error::Corrupt { digest: *digest }) }
     }
 
     fn stage(&mut self, set: &SetManifest) -> Result<(), Error> {

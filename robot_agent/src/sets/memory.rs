@@ -116,7 +116,7 @@ impl State {
     fn verify_content(&self, set: &SetManifest) -> Result<(), Error> {
         for component in set.components.values() {
             let bytes = self.content.get(&component.digest).ok_or(Error::Missing(component.digest))?;
-            if Digest::of(bytes) != component.digest {
+            if Digest::of_content(bytes) != component.digest {
                 return Err(Error::Corrupt { digest: component.digest });
             }
         }
@@ -125,7 +125,7 @@ impl State {
     fn verify_base(&self, set: &SetManifest) -> Result<(), Error> {
         let Some(base) = set.base() else { return Ok(()) };
         let slot = self.boot.slot_of(&base_name(set)).ok_or(Error::Missing(base.digest))?;
-        let is_whole = Digest::of(&self.slots[slot as usize]) == base.digest;
+        let is_whole = Digest::of_content(&self.slots[slot as usize]) == base.digest;
         if is_whole { Ok(()) } else { Err(Error::Corrupt { digest: base.digest }) }
     }
     /// The base of a set that is in the switch record, or of the factory's.
@@ -195,7 +195,7 @@ impl Sets for MemorySets {
             return Ok(());
         }
         let part = state.part(wanted)?;
-        let whole = part.written.missing().is_empty() && Digest::of(&part.bytes) == wanted.digest;
+        let whole = part.written.missing().is_empty() && Digest::of_content(&part.bytes) == wanted.digest;
         let part = state.parts.remove(&wanted.digest).filter(|_| whole);
         let part = part.ok_or(Error::Corrupt { digest: wanted.digest })?;
         state.content.insert(wanted.digest, part.bytes);
@@ -213,7 +213,7 @@ impl Sets for MemorySets {
         let (mut base, mut bytes) = (base.map(Cursor::new), Vec::new());
         let base = base.as_mut().map(|base| base as &mut dyn Base);
         let decoded = encoding::decode(base, &mut &*way, wanted.length, &mut bytes);
-        if decoded.is_err() || Digest::of(&bytes) != wanted.digest {
+        if decoded.is_err() || Digest::of_content(&bytes) != wanted.digest {
             return Err(Error::Corrupt { digest: wanted.digest });
         }
         state.parts.remove(&wanted.digest);
@@ -236,7 +236,7 @@ impl Sets for MemorySets {
         if bytes.len() as u64 > most {
             return Err(refuse("reading content", io::ErrorKind::FileTooLarge));
         }
-        if Digest::of(bytes) == *digest { Ok(bytes.clone()) } else { Err(Error::Corrupt { digest: *digest }) }
+        if Digest::of_content(bytes) == *digest { Ok(bytes.clone()) } else { Err(Error::Corrupt { digest: *digest }) }
     }
 
     fn stage(&mut self, set: &SetManifest) -> Result<(), Error> {
@@ -267,14 +267,14 @@ impl Sets for MemorySets {
         let component = if file == PROGRAM { set.program() } else { set.components.get(file) };
         let component = component.ok_or(Error::Missing(*id))?;
         let bytes = state.content.get(&component.digest).ok_or(Error::Missing(component.digest))?;
-        if Digest::of(bytes) != component.digest {
+        if Digest::of_content(bytes) != component.digest {
             return Err(Error::Corrupt { digest: component.digest });
         }
         if component.kind == ComponentKind::Base { state.verify_base(set) } else { Ok(()) }
     }
 
     fn discard(&mut self, wanted: &Wanted) -> Result<(), Error> {
-        self.state().content.retain(|digest, bytes| *digest != wanted.digest || Digest::of(bytes) == *digest);
+        self.state().content.retain(|digest, bytes| *digest != wanted.digest || Digest::of_content(bytes) == *digest);
         Ok(())
     }
 

@@ -129,7 +129,7 @@ impl Stops {
     /// Looks at everything at this moment.
     pub(crate) fn look_around(&mut self, now: &Now, pose: Option<&Pose>, around: Around) {
         self.around = around;
-        self.obeyed = self.robot.look(now, pose, around);
+        self.obeyed = self.robot.advance(now, pose, around);
         self.changed(self.obeyed.is_changed);
     }
 

@@ -42,7 +42,7 @@ pub struct SoftwareRow {
 impl SoftwareRow {
     /// As it is once this directive was taken.
     pub(crate) fn with(&self, directive: &Directive, desired: &DesiredUpdate) -> Self {
-        let envelope = Some(Digest::of(desired.directive.as_bytes()));
+        let envelope = Some(Digest::of_content(desired.directive.as_bytes()));
         Self { directive: directive.generation, envelope, update: None, ..self.clone() }
     }
     /// The newest update as it is reported.

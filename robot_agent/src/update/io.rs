@@ -218,7 +218,7 @@ impl UpdateWorker {
                     break;
                 }
             }
-            if Digest::of(&bytes) != listed.digest {
+            if Digest::of_content(&bytes) != listed.digest {
                 return Err(io::Error::new(io::ErrorKind::InvalidData, "a set of directive keys came as other bytes"));
             }
             sets.insert(number, bytes);

@@ -14,7 +14,7 @@ const LONGEST: (LinkDuration, LinkDuration) = (LinkDuration(1_000), LinkDuration
 pub(crate) fn pause(robot_id: &RobotId, failures: u32) -> LinkDuration {
     let (first, most) = LONGEST;
     let longest = first.as_ms().saturating_mul(1 << failures.saturating_sub(1).min(6)).min(most.as_ms());
-    let drawn = u64::from(Digest::of(format!("{failures} {robot_id}").as_bytes()).bytes()[0]);
+    let drawn = u64::from(Digest::of_content(format!("{failures} {robot_id}").as_bytes()).bytes()[0]);
     LinkDuration(longest / 2 + longest / 2 * drawn / u64::from(u8::MAX))
 }
 

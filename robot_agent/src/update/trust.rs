@@ -101,7 +101,7 @@ impl Trust {
         let page: Page = serde_json::from_slice(bytes).map_err(|e| Refusal::field("trust", e.to_string()))?;
         let mut bad = Violations::default();
         let root = page.root.to_string().into_bytes();
-        bad.take("root", check_root(&root, &root));
+        bad.accept("root", check_root(&root, &root));
         let mut directive_keys = BTreeMap::new();
         for (at, key) in page.directive_keys.iter().enumerate() {
             let field = format!("directive_keys[{at}]");
@@ -116,7 +116,7 @@ impl Trust {
         if !(1..=DIRECTIVE_KEYS_MAX).contains(&page.directive_keys.len()) {
             bad.add("directive_keys", format!("must be 1 to {DIRECTIVE_KEYS_MAX}"));
         }
-        let site = bad.take("site", SiteId::parse(&page.site));
+        let site = bad.accept("site", SiteId::parse(&page.site));
         bad.finish()?;
         match site {
             Some(site) => Ok(Self { root, directive_keys, site }),

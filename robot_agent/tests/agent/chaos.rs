@@ -314,7 +314,7 @@ fn the_judge_catches_a_robot_that_counts_its_grants_from_receipt() {
     let config =
         ProptestConfig { cases: 400, failure_persistence: None, max_shrink_iters: 0, ..ProptestConfig::default() };
     let mut runner = TestRunner::new_with_rng(config, TestRng::deterministic_rng(RngAlgorithm::ChaCha));
-    let naive = Bugs::of(&[SeededBug::GrantFromReceipt]);
+    let naive = Bugs::seeded(&[SeededBug::GrantFromReceipt]);
     let caught = runner.run(&proptest::collection::vec(acts(), 1..60), |acts| {
         live(naive, &acts);
         Ok(())

@@ -163,7 +163,7 @@ fn reconnected_with_standing_grants(rig: Rig) -> Rig {
 fn a_grant_that_stood_while_the_robot_reconnected_moves_nobody() {
     let mut rig = reconnected_with_standing_grants(Rig::at("A"));
     assert_eq!((rig.body.goes_to(), rig.places()), (vec![], vec![]));
-    let naive = Bugs::of(&[SeededBug::GrantFromReceipt]);
+    let naive = Bugs::seeded(&[SeededBug::GrantFromReceipt]);
     let mut rig = reconnected_with_standing_grants(Rig::with(TestBody::at("A"), MemoryStore::new(), naive));
     assert_eq!(rig.places(), [("door".into(), 11, Entered)]);
 }

@@ -17,7 +17,7 @@ fn drive(rig: &Rig, name: &str, epoch: u64) -> Assignment {
 
 /// A rig with this naive rule on.
 fn naive(bug: SeededBug) -> Rig {
-    Rig::with(TestBody::at("A"), MemoryStore::new(), Bugs::of(&[bug]))
+    Rig::with(TestBody::at("A"), MemoryStore::new(), Bugs::seeded(&[bug]))
 }
 
 fn offered(mut rig: Rig, after_ms: u64) -> Rig {

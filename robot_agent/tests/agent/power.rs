@@ -168,7 +168,7 @@ fn update(folder: &Path, steps: usize, ledger: &mut dyn FnMut(&str)) {
         if !sets.missing(&wanted(grip)).expect("tells").is_empty() {
             let way = patch(&weights(1), grip);
             fetch(&mut sets, &way);
-            sets.decode(&wanted(grip), Some(&Digest::of(&weights(1))), &wanted(&way)).expect("leads there");
+            sets.decode(&wanted(grip), Some(&Digest::of_content(&weights(1))), &wanted(&way)).expect("leads there");
         }
         ledger("staged");
         sets.stage(&next).expect("stages");

@@ -199,7 +199,7 @@ impl Releases {
         let bytes = manifest.to_bytes();
         let file = |name: String, content: &[u8]| FileTarget {
             name,
-            digest: Digest::of(content),
+            digest: Digest::of_content(content),
             length: content.len() as u64,
         };
         let mut files = vec![
@@ -210,8 +210,8 @@ impl Releases {
         let held = |c: &Component| FileTarget { name: c.target(), digest: c.digest, length: c.length };
         files.extend(manifest.components[2..].iter().map(held));
         self.sign(&files);
-        let bundle = Bundle { digest: Digest::of(&bytes), length: bytes.len() as u64, manifest };
-        self.shelf().bytes.extend([bytes, program, settings].map(|b| (Digest::of(&b), b)));
+        let bundle = Bundle { digest: Digest::of_content(&bytes), length: bytes.len() as u64, manifest };
+        self.shelf().bytes.extend([bytes, program, settings].map(|b| (Digest::of_content(&b), b)));
         bundle
     }
     /// The order to take `bundle`, signed.
@@ -273,8 +273,8 @@ impl Releases {
     }
     /// Has bytes that no release lists.
     pub fn hold(&self, bytes: &[u8]) -> Wanted {
-        self.shelf().bytes.insert(Digest::of(bytes), bytes.to_vec());
-        Wanted { digest: Digest::of(bytes), length: bytes.len() as u64 }
+        self.shelf().bytes.insert(Digest::of_content(bytes), bytes.to_vec());
+        Wanted { digest: Digest::of_content(bytes), length: bytes.len() as u64 }
     }
     pub fn drop_bytes(&self, digest: &Digest) {
         self.shelf().bytes.remove(digest);

@@ -245,8 +245,8 @@ impl Bench {
     /// What the robot makes of an answer about ways.
     async fn way(&self, answer: GetEncodingResponse) -> Way {
         *self.shop.encoding.lock().expect("not poisoned") = answer;
-        let wanted = Wanted { digest: Digest::of(b"new"), length: 1_000 };
-        self.remote.way(&wanted, &[Digest::of(b"old")]).await.expect("answers")
+        let wanted = Wanted { digest: Digest::of_content(b"new"), length: 1_000 };
+        self.remote.way(&wanted, &[Digest::of_content(b"old")]).await.expect("answers")
     }
     fn connections(&self) -> (usize, usize) {
         (*self.open.borrow(), *self.dialed.borrow())
@@ -290,7 +290,7 @@ async fn a_release_comes_over_the_wire_whole() {
     let Done::Manifest { manifest: read, bytes } = work(&mut worker, Job::Manifest { wanted: manifest }).await else {
         panic!("no manifest")
     };
-    assert_eq!((*read, Digest::of(&bytes)), (bundle.manifest.clone(), bundle.digest));
+    assert_eq!((*read, Digest::of_content(&bytes)), (bundle.manifest.clone(), bundle.digest));
     let wanted = program(&bundle);
     assert!(matches!(work(&mut worker, Job::Fetch { wanted, bases: Vec::new(), rate_bytes_s: 0 }).await, Done::Ok));
     assert_eq!(sets.read(&wanted.digest, wanted.length).expect("is there").len() as u64, wanted.length);
@@ -313,7 +313,7 @@ async fn it_comes_over_tcp_too() {
     while let Some(piece) = pieces.next().await {
         bytes.extend(piece.expect("a piece"));
     }
-    assert_eq!(Digest::of(&bytes), wanted.digest);
+    assert_eq!(Digest::of_content(&bytes), wanted.digest);
 }
 
 #[tokio::test(start_paused = true)]
@@ -321,7 +321,7 @@ async fn what_is_not_there_is_told_from_a_server_that_does_not_answer() {
     let bench = Bench::new();
     let bundle = bench.releases.release("1.0.0");
     assert_eq!(bench.remote.metadata("7.root.json").await.expect("answers"), None);
-    let nothing = Wanted { digest: Digest::of(b"of nobody"), length: 10 };
+    let nothing = Wanted { digest: Digest::of_content(b"of nobody"), length: 10 };
     assert_eq!(bench.read(nothing).await, (vec![], Some(ErrorKind::NotFound)));
     bench.server_is(Wrong::Refuses);
     assert!(bench.remote.metadata("7.root.json").await.is_err());
@@ -333,7 +333,7 @@ async fn bytes_that_do_not_come_as_they_should_are_not_handed_on() {
     let bench = Bench::new();
     let wanted = program(&bench.releases.release("1.0.0"));
     let (whole, error) = bench.read(wanted).await;
-    assert_eq!((Digest::of(&whole), error), (wanted.digest, None));
+    assert_eq!((Digest::of_content(&whole), error), (wanted.digest, None));
     let last_full = whole.len() / PIECE_BYTES * PIECE_BYTES;
     let cases = [
         (Wrong::Broken, PIECE_BYTES, ErrorKind::InvalidData),
@@ -402,7 +402,7 @@ async fn a_connection_that_nobody_uses_is_closed_and_one_in_use_is_not() {
 #[tokio::test(start_paused = true)]
 async fn a_shorter_way_is_asked_for_with_what_is_there_and_an_answer_without_sense_is_none() {
     let bench = Bench::new();
-    let [old, way] = [b"old", b"way"].map(|content| Digest::of(content));
+    let [old, way] = [b"old", b"way"].map(|content| Digest::of_content(content));
     let answer = GetEncodingResponse {
         encoding: Encoding::ZstdPatch.into(),
         base_digest: old.to_string(),
@@ -424,7 +424,8 @@ async fn a_shorter_way_is_asked_for_with_what_is_there_and_an_answer_without_sen
         assert_eq!(bench.way(answer.clone()).await, Way::AsItIs, "{answer:?}");
     }
     let asked = bench.shop.asked.lock().expect("not poisoned")[0].clone();
-    let expected = GetEncodingRequest { digest: Digest::of(b"new").to_string(), base_digests: vec![old.to_string()] };
+    let expected =
+        GetEncodingRequest { digest: Digest::of_content(b"new").to_string(), base_digests: vec![old.to_string()] };
     assert_eq!(asked, expected);
     bench.server_is(Wrong::Old);
     assert_eq!(bench.way(answer).await, Way::AsItIs);

@@ -433,13 +433,13 @@ async fn a_robot_on_its_file_takes_work_over_the_wire_and_does_it() {
 fn one_set() -> MemorySets {
     let mut sets = MemorySets::new();
     let content = b"settings 1.1.0";
-    let wanted = Wanted { digest: Digest::of(content), length: content.len() as u64 };
+    let wanted = Wanted { digest: Digest::of_content(content), length: content.len() as u64 };
     sets.write(&wanted, 0, content).expect("writes");
     sets.sync(&wanted).expect("syncs");
     sets.seal(&wanted).expect("seals");
     let part = component("behaviour", "1.1.0", ComponentKind::Config, content);
     let set = SetManifest {
-        bundle: Some(Digest::of(b"bundle")),
+        bundle: Some(Digest::of_content(b"bundle")),
         version: "walk 1.1.0".to_owned(),
         components: [(part.name.clone(), part)].into(),
     };

@@ -87,7 +87,7 @@ pub fn bomb() -> Vec<u8> {
 }
 
 pub fn wanted(content: &[u8]) -> Wanted {
-    Wanted { digest: Digest::of(content), length: content.len() as u64 }
+    Wanted { digest: Digest::of_content(content), length: content.len() as u64 }
 }
 
 pub fn put_content(sets: &mut dyn Sets, content: &[u8]) -> Wanted {
@@ -109,7 +109,7 @@ pub fn set(version: &str, program: &[u8], settings: &[u8]) -> SetManifest {
     let components =
         [component("gait", ComponentKind::Process, program), component("behaviour", ComponentKind::Config, settings)];
     SetManifest {
-        bundle: Some(Digest::of(version.as_bytes())),
+        bundle: Some(Digest::of_content(version.as_bytes())),
         version: version.to_owned(),
         components: components.into_iter().map(|c| (c.name.clone(), c)).collect(),
     }
@@ -209,7 +209,7 @@ fn a_set_whose_bytes_changed_on_the_disk_is_found_out_and_can_come_again() {
     for place in Place::both() {
         let mut sets = place.open();
         let set = staged(&mut *sets, "v1", b"program", b"settings");
-        place.rot(&Digest::of(b"settings"));
+        place.rot(&Digest::of_content(b"settings"));
         assert!(matches!(sets.verify(&set.id()), Err(Error::Corrupt { .. })));
         assert!(matches!(sets.stage(&set), Err(Error::Corrupt { .. })));
         put_content(&mut *sets, b"settings");
@@ -238,8 +238,8 @@ fn only_what_nobody_names_is_deleted() {
         let ids: Vec<Digest> = sets.holdings().expect("tells").sets.into_keys().collect();
         let expected: BTreeSet<Digest> = [&kept, &running, &incoming].map(SetManifest::id).into();
         assert_eq!(ids, expected.into_iter().collect::<Vec<_>>());
-        assert!(sets.read(&Digest::of(b"one"), 10).is_err(), "nobody else has it");
-        assert!(sets.read(&Digest::of(b"program"), 10).is_ok(), "others have it");
+        assert!(sets.read(&Digest::of_content(b"one"), 10).is_err(), "nobody else has it");
+        assert!(sets.read(&Digest::of_content(b"program"), 10).is_ok(), "others have it");
         assert_eq!(sets.missing(&coming).expect("tells"), [], "a download is kept");
         assert!(sets.verify(&old.id()).is_err());
         for set in [&kept, &running, &incoming] {
@@ -384,7 +384,7 @@ fn no_room_is_told_from_other_errors() {
     sets.limit(100);
     let error = sets.clone().missing(&wanted(&bytes(1, 101))).expect_err("does not fit");
     assert!(error.is_full());
-    assert!(!Error::Missing(Digest::of(b"")).is_full());
+    assert!(!Error::Missing(Digest::of_content(b"")).is_full());
 }
 
 #[test]
@@ -392,7 +392,7 @@ fn sizes_around_2_31_and_2_32_are_files_like_others() {
     let folder = tempfile::tempdir().expect("a folder");
     let mut sets = DiskSets::open(folder.path()).expect("opens");
     for length in [(1_u64 << 31) - 1, 1 << 31, (1 << 31) + 1, (1 << 32) - 1, 1 << 32, (1 << 32) + 1] {
-        let wanted = Wanted { digest: Digest::of(&length.to_be_bytes()), length };
+        let wanted = Wanted { digest: Digest::of_content(&length.to_be_bytes()), length };
         let last = (length - 1) / CHUNK_BYTES * CHUNK_BYTES;
         sets.write(&wanted, last, &bytes(1, length - last)).expect("writes");
         sets.sync(&wanted).expect("syncs");
@@ -437,7 +437,7 @@ fn a_way_that_leads_elsewhere_makes_no_content_and_goes() {
             (right.clone(), None, new_one),
             (right.clone(), Some(base), Wanted { length: new_one.length - 1, ..new_one }),
             (right.clone(), Some(base), Wanted { length: new_one.length + 1, ..new_one }),
-            (right, Some(base), Wanted { digest: Digest::of(b"another"), ..new_one }),
+            (right, Some(base), Wanted { digest: Digest::of_content(b"another"), ..new_one }),
             (bomb(), None, new_one),
         ];
         for (way, base, wanted) in cases {
@@ -448,7 +448,7 @@ fn a_way_that_leads_elsewhere_makes_no_content_and_goes() {
             assert!(sets.read(&encoded.digest, encoded.length).is_err(), "the way went");
         }
         let encoded = put_content(&mut *sets, &patch(&old, &new));
-        let nothing = Digest::of(b"of nobody");
+        let nothing = Digest::of_content(b"of nobody");
         assert!(
             matches!(sets.decode(&new_one, Some(&nothing), &encoded), Err(Error::Missing(digest)) if digest == nothing)
         );
@@ -513,7 +513,9 @@ fn a_base_takes_the_slot_that_does_not_run_and_the_set_that_needed_it_is_kept_no
         }
         based(&mut *sets, "v4", b"base 4");
         assert_eq!(kept(&mut *sets), None, "v2 cannot be gone back to");
-        assert!(matches!(sets.verify(&same.id()), Err(Error::Missing(digest)) if digest == Digest::of(b"base 1")));
+        assert!(
+            matches!(sets.verify(&same.id()), Err(Error::Missing(digest)) if digest == Digest::of_content(b"base 1"))
+        );
         sets.verify(&third.id()).expect("what runs is untouched");
     }
 }

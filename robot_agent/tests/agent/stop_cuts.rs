@@ -85,7 +85,7 @@ fn hear_news(robot: &mut RobotStop, news: &News) -> bool {
             false
         }
     };
-    robot.look(&now, None, Around::People).is_changed | is_new
+    robot.advance(&now, None, Around::People).is_changed | is_new
 }
 
 fn begun(kept: Kept) -> RobotStop {

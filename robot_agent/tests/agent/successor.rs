@@ -112,7 +112,7 @@ impl Successor {
 fn update(state: UpdateState) -> Update {
     Update {
         state,
-        bundle: Digest::of(b"bundle"),
+        bundle: Digest::of_content(b"bundle"),
         manifest_length: 7,
         rollback_floor: 1,
         set: Some(set("v2", b"program", b"settings")),
@@ -154,7 +154,7 @@ fn rows(state: UpdateState) -> Vec<Op> {
     let key = SecretKey::of_seed([5; 32]).public();
     let software = SoftwareRow {
         directive: 3,
-        envelope: Some(Digest::of(b"envelope")),
+        envelope: Some(Digest::of_content(b"envelope")),
         keys: Some(HeldKeys { number: 2, from: vec![key.id()], keys: vec![key] }),
         grant_id: 8,
         floors: [("gait".to_owned(), 1)].into(),

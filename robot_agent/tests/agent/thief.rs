@@ -56,7 +56,7 @@ fn a_thief_of_all_keys_of_a_server_holds_a_robot_back_until_they_are_changed_and
     assert_eq!(ordered(&mut met, &releases, DIRECTIVE, &first, 2), Some(Code::MetadataRefused));
     releases.present(ONLINE, (2, &old), 50);
     assert_eq!(ordered(&mut met, &releases, DIRECTIVE, &first, 3), Some(Code::MetadataRefused));
-    let evil = FileTarget { name: "walk-6.6.6.manifest".to_owned(), digest: Digest::of(b"evil"), length: 4 };
+    let evil = FileTarget { name: "walk-6.6.6.manifest".to_owned(), digest: Digest::of_content(b"evil"), length: 4 };
     let by = SecretKey::of_seed([ONLINE.0; 32]);
     let forged = sign_targets(Some(&newest), &[evil], &[], SIGNED.plus_ms(PEOPLE_LIFE_MS), &[&by]).expect("signed");
     releases.present(ONLINE, (4, &forged), 51);

@@ -13,7 +13,7 @@ use midshift_proto::session::Downlink;
 
 fn rig(bugs: &[SeededBug]) -> (Rig, Releases) {
     let releases = Releases::new();
-    (freed(Rig::naive(&releases, Bugs::of(bugs))), releases)
+    (freed(Rig::naive(&releases, Bugs::seeded(bugs))), releases)
 }
 
 /// Under way to C over B, whose lane has a speed limit.

@@ -37,11 +37,11 @@ impl Bench {
         self.releases.ways(&wanted(&self.new), ways);
     }
     fn patched(&self) -> Way {
-        Way::Shorter { base: Some(Digest::of(&self.old)), encoded: wanted(&self.patch) }
+        Way::Shorter { base: Some(Digest::of_content(&self.old)), encoded: wanted(&self.patch) }
     }
     async fn fetch(&self) -> Done {
         let mut worker = UpdateWorker::new(Box::new(self.sets.clone()), Arc::new(self.releases.clone()));
-        let job = Job::Fetch { wanted: wanted(&self.new), bases: vec![Digest::of(&self.old)], rate_bytes_s: 0 };
+        let job = Job::Fetch { wanted: wanted(&self.new), bases: vec![Digest::of_content(&self.old)], rate_bytes_s: 0 };
         worker.work(job, CancellationToken::new()).await
     }
     fn has_new(&self) -> bool {
@@ -58,8 +58,8 @@ async fn a_patch_from_what_is_installed_brings_a_file_with_few_bytes_and_leaves_
     assert!(bench.has_new());
     assert_eq!(bench.releases.served(), bench.patch.len() as u64);
     assert!(bench.patch.len() < bench.new.len() / 100);
-    assert_eq!(bench.releases.asked(), vec![vec![Digest::of(&bench.old)]]);
-    assert!(bench.sets.clone().read(&Digest::of(&bench.patch), 1 << 20).is_err(), "the patch went");
+    assert_eq!(bench.releases.asked(), vec![vec![Digest::of_content(&bench.old)]]);
+    assert!(bench.sets.clone().read(&Digest::of_content(&bench.patch), 1 << 20).is_err(), "the patch went");
 }
 
 #[tokio::test(start_paused = true)]
@@ -86,7 +86,7 @@ async fn a_way_that_does_not_lead_there_is_left_for_good_and_the_file_comes_as_i
     for wrong in [&tampered, &other, &bomb] {
         let bench = Bench::new();
         let encoded = bench.releases.hold(wrong);
-        bench.says(vec![Way::Shorter { base: Some(Digest::of(&bench.old)), encoded }]);
+        bench.says(vec![Way::Shorter { base: Some(Digest::of_content(&bench.old)), encoded }]);
         assert!(matches!(bench.fetch().await, Done::Ok));
         assert!(bench.has_new());
         assert_eq!(bench.releases.served(), (wrong.len() + bench.new.len()) as u64);
@@ -106,10 +106,10 @@ async fn a_way_that_does_not_lead_there_is_left_for_good_and_the_file_comes_as_i
 #[tokio::test(start_paused = true)]
 async fn an_answer_that_cannot_be_meant_is_not_followed() {
     let bench = Bench::new();
-    let base = Some(Digest::of(&bench.old));
+    let base = Some(Digest::of_content(&bench.old));
     let (new, patch) = (wanted(&bench.new), wanted(&bench.patch));
     let cases = [
-        Way::Shorter { base: Some(Digest::of(b"of nobody")), encoded: patch },
+        Way::Shorter { base: Some(Digest::of_content(b"of nobody")), encoded: patch },
         Way::Shorter { base, encoded: Wanted { length: new.length, ..patch } },
         Way::Shorter { base, encoded: Wanted { length: 0, ..patch } },
         Way::Shorter { base, encoded: Wanted { length: 100, ..new } },
@@ -127,12 +127,12 @@ async fn an_answer_that_cannot_be_meant_is_not_followed() {
 async fn a_way_that_went_or_a_base_that_rotted_does_not_keep_a_file_from_coming() {
     let bench = Bench::new();
     bench.says(vec![bench.patched()]);
-    bench.releases.drop_bytes(&Digest::of(&bench.patch));
+    bench.releases.drop_bytes(&Digest::of_content(&bench.patch));
     assert!(matches!(bench.fetch().await, Done::Ok) && bench.has_new());
     assert!(!bench.sets.clone().is_fetched_as_it_is(&wanted(&bench.new)).expect("tells"));
     let bench = Bench::new();
     bench.says(vec![bench.patched()]);
-    bench.sets.rot(&Digest::of(&bench.old));
+    bench.sets.rot(&Digest::of_content(&bench.old));
     assert!(matches!(bench.fetch().await, Done::Ok) && bench.has_new());
 }
 

@@ -30,7 +30,7 @@ struct Sent {
 }
 
 impl Sent {
-    fn of(item: &Item) -> Self {
+    fn from_item(item: &Item) -> Self {
         let keys = item.rows.iter().map(|row| row.key.clone()).collect();
         Self { kind: projection::kind_of(item), keys, obeys: obeyed(item), entries: projection::entries_of(item) }
     }
@@ -47,7 +47,7 @@ impl Loop {
     ) -> Result<(), ()> {
         let renews = renewal.is_some();
         let items: Vec<Item> = renewal.into_iter().chain(plan.items).collect();
-        let sent: Vec<Sent> = items.iter().map(Sent::of).collect();
+        let sent: Vec<Sent> = items.iter().map(Sent::from_item).collect();
         let mut results = if items.is_empty() { Vec::new() } else { self.parts.store.commit(items).await };
         if renews && results.first().is_some_and(Result::is_ok) {
             self.seat.claimed(now.link);

@@ -256,7 +256,7 @@ impl Loop {
     async fn turn(&mut self, pace: Pace, requests: Vec<Request>) -> Result<(), ()> {
         let again = std::mem::take(&mut self.again);
         let requests = again.into_iter().chain(requests).collect();
-        self.hear();
+        self.read_board();
         let unreadable = |error| tracing::warn!(%error, "fleet cannot read the store");
         // What the clock says comes first: a process that was away decides nothing before it has read who leads.
         if self.seat.stance(self.parts.clock.now().link) == Stance::StepDown {
@@ -286,10 +286,10 @@ impl Loop {
     }
 
     /// Takes what robots said since.
-    fn hear(&mut self) {
+    fn read_board(&mut self) {
         // Before the board is taken: what is read into it meanwhile may be known, or not.
         self.heard_up_to = self.parts.board.read_up_to();
-        for (robot_id, live) in self.dirty.take() {
+        for (robot_id, live) in self.dirty.take_changed() {
             match live {
                 Some(live) => self.board.insert(robot_id, live),
                 None => self.board.remove(&robot_id),
@@ -304,7 +304,7 @@ impl Loop {
         // People come first: what is planned beside a command is the least that goes on.
         let has_command = requests.iter().any(|request| matches!(request, Request::Do(_)));
         let share = if has_command { limits::DECISIONS_PER_STAGE_MIN } else { self.share };
-        let mut plan = Plan::of(Slice::of(share));
+        let mut plan = Plan::for_slice(Slice::for_decisions(share));
         self.take_feed(now, &mut plan).await.map_err(|error| tracing::warn!(%error, "fleet cannot read the feed"))?;
         let unread = |error| tracing::warn!(%error, "fleet cannot read what is over");
         self.ask(used_ids(&requests)).await.map_err(unread)?;
@@ -413,7 +413,7 @@ impl Loop {
             return Ok(());
         }
         let rows = self.parts.store.get(keys.clone()).await?;
-        Ok(self.view.tell(&keys, &rows)?)
+        Ok(self.view.apply_rows(&keys, &rows)?)
     }
 
     fn take_requests(&mut self, requests: Vec<Request>, now: Now, plan: &mut Plan) -> Replies {

@@ -64,7 +64,7 @@ async fn prune_tasks(store: &dyn Store, now: Utc) -> Result<u64, Error> {
         let query = Query { after, ..Query::all(Table::TaskState).in_states(terminal.iter().copied()) };
         let page = store.list(query).await?;
         let Some(last) = page.last() else { break };
-        after = Some(Cursor::of(last));
+        after = Some(Cursor::of_row(last));
         // What was admitted since cannot have ended before.
         let is_last = load::<TaskIntake>(store, &last.key.id).await?.is_some_and(|(i, _)| i.created > before);
         let mut old: Vec<(TaskState, Row)> =
@@ -126,7 +126,7 @@ async fn prune_errands(store: &dyn Store, now: Utc) -> Result<u64, Error> {
         let query =
             Query { after: Some(after.clone()), ..Query::all(Table::Attempt).in_states(terminal.iter().copied()) };
         let page = store.list(Query { limit: limits::ITEM_ROWS_MAX, ..query }).await?;
-        let Some(last) = page.last().map(Cursor::of) else { return Ok(forgotten) };
+        let Some(last) = page.last().map(Cursor::of_row) else { return Ok(forgotten) };
         let is_last = last.order > before.0;
         after = last;
         let mut old = page;
@@ -148,7 +148,7 @@ async fn prune_counters(store: &dyn Store, now: Utc) -> Result<u64, Error> {
     let mut old = Vec::new();
     loop {
         let page = store.list(Query { after, ..Query::all(Table::RobotCounter) }).await?;
-        let Some(last) = page.last().map(Cursor::of) else { break };
+        let Some(last) = page.last().map(Cursor::of_row) else { break };
         let is_old = |row: &Row| now.ms_since(Utc(row.index.order.unwrap_or_default())) > limits::GONE_KEPT.as_ms();
         let is_last = page.last().is_some_and(|row| !is_old(row));
         after = Some(last);

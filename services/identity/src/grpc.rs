@@ -84,7 +84,7 @@ impl IdentityService {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
-        let all = self.0.register.look(tokens::newest_first).await.map_err(|_| unavailable())?;
+        let all = self.0.register.ask(tokens::newest_first).await.map_err(|_| unavailable())?;
         let (page, next_page_token) = pages::page(all.into_iter(), &r.page_token, size);
         Ok(v1::ListTokensResponse { tokens: page.iter().map(encode::token).collect(), next_page_token })
     }
@@ -156,7 +156,7 @@ impl IdentityService {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
-        let page = self.0.register.look(|view| {
+        let page = self.0.register.ask(|view| {
             let robots = view.robots.values().map(|(robot, _)| robot);
             let begin = robots.filter(|robot| robot.robot_id.as_str().starts_with(&r.robot_id_prefix));
             pages::page(begin.map(|robot| (robot.robot_id.to_string(), encode::robot(robot))), &r.page_token, size)
@@ -167,7 +167,7 @@ impl IdentityService {
 
     async fn enrolled(&self, r: v1::EnrolRequest) -> Result<v1::EnrolResponse, Refusal> {
         let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let robot_id = bad.accept("robot_id", RobotId::parse(&r.robot_id));
         let secret = Secret::read(Secret::ENROLMENT, &r.secret);
         if secret.is_none() {
             bad.add("secret", "must be the secret of `midshift robot enroll`, mse.ID.DIGITS");
@@ -338,14 +338,14 @@ impl IdentityFace for IdentityService {
 #[tonic::async_trait]
 impl EnrolmentFace for IdentityService {
     async fn enrol(&self, request: Request<v1::EnrolRequest>) -> Result<Response<v1::EnrolResponse>, Status> {
-        let denying = Denying::of(&request);
-        answered(self.enrolled(request.into_inner()).await.inspect_err(|refusal| denying.tell(refusal)))
+        let denying = Denying::from_request(&request);
+        answered(self.enrolled(request.into_inner()).await.inspect_err(|refusal| denying.report(refusal)))
     }
     async fn renew_certificate(
         &self,
         request: Request<v1::RenewCertificateRequest>,
     ) -> Result<Response<v1::RenewCertificateResponse>, Status> {
-        let (caller, denying) = (caller(&request), Denying::of(&request));
-        answered(self.renewed(request.into_inner(), &caller).await.inspect_err(|refusal| denying.tell(refusal)))
+        let (caller, denying) = (caller(&request), Denying::from_request(&request));
+        answered(self.renewed(request.into_inner(), &caller).await.inspect_err(|refusal| denying.report(refusal)))
     }
 }

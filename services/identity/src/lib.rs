@@ -195,7 +195,7 @@ impl IdentityService {
     /// The store, or the disk.
     pub fn append_revocations<'a>(&'a self, list: &'a RevocationList) -> Boxed<'a, Result<(), Error>> {
         Box::pin(async {
-            let revoked = self.0.register.look(|view| {
+            let revoked = self.0.register.ask(|view| {
                 revocations(view.tokens.values().map(|(token, _)| token), view.robots.values().map(|(robot, _)| robot))
             });
             list.append(&revoked.await.map_err(Error::Store)?).await
@@ -241,7 +241,7 @@ impl IdentityService {
 
 /// The authority in the folder: the one the rows know, or a first one.
 async fn own_authority(folder: &Path, site_id: &SiteId, register: &Register, now: Utc) -> Result<Authority, Error> {
-    let known = register.look(|view| view.authority.as_ref().map(|(row, _)| row.certificate_pem.clone()));
+    let known = register.ask(|view| view.authority.as_ref().map(|(row, _)| row.certificate_pem.clone()));
     let (known, found) = (known.await.map_err(Error::Store)?, Authority::load(folder, site_id)?);
     let other = || Error::OtherAuthority { path: folder.to_owned() };
     let authority = match (known, found) {
@@ -262,7 +262,7 @@ async fn own_authority(folder: &Path, site_id: &SiteId, register: &Register, now
 async fn answer(authority: &Authority, register: &Register, now: Utc) -> Result<(), Error> {
     let open = |row: &&ServerCertificate| row.chain_pem.is_none();
     let waiting =
-        register.look(|view| view.servers.values().map(|(row, _)| row).filter(open).cloned().collect::<Vec<_>>());
+        register.ask(|view| view.servers.values().map(|(row, _)| row).filter(open).cloned().collect::<Vec<_>>());
     for row in waiting.await.map_err(Error::Store)? {
         let signed = match asked(&row.request_pem) {
             Ok(asked) => authority.sign_server(asked, &row.names, now),

@@ -24,8 +24,8 @@ impl IdentityService {
         actor: &Caller,
     ) -> Result<v1::AdoptRobotResponse, Refusal> {
         let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
-        let key = bad.take("key_sha256", r.key_sha256.parse::<Digest>());
+        let robot_id = bad.accept("robot_id", RobotId::parse(&r.robot_id));
+        let key = bad.accept("key_sha256", r.key_sha256.parse::<Digest>());
         bad.finish()?;
         let (Some(robot_id), Some(key)) = (robot_id, key) else {
             return Err(Refusal::field("key_sha256", "is required"));

@@ -64,7 +64,7 @@ impl OwnKey {
     /// # Errors
     /// The store does not answer.
     pub async fn proof(&self, register: &Register) -> Result<Option<ServerProof>, Error> {
-        let found = register.look(|view| {
+        let found = register.ask(|view| {
             let (row, _) = view.servers.get(&self.digest.to_string())?;
             let (authority, _) = view.authority.as_ref()?;
             Some((row.chain_pem.clone()?, authority.certificate_pem.clone()))

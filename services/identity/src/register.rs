@@ -104,7 +104,7 @@ impl Register {
         rows.advance(&*self.store).await?;
         let view = rows.fold();
         let (tokens, robots) = (view.tokens.values().map(|(t, _)| t), view.robots.values().map(|(r, _)| r));
-        let directory = Directory::of(tokens, robots, self.clock.now().steady_wall());
+        let directory = Directory::from_rows(tokens, robots, self.clock.now().steady_wall());
         self.directory.send_if_modified(|known| {
             let differs = **known != directory;
             if differs {
@@ -119,7 +119,7 @@ impl Register {
     ///
     /// # Errors
     /// The store does not answer.
-    pub async fn look<T>(&self, look: impl FnOnce(&View) -> T) -> Result<T, Error> {
+    pub async fn ask<T>(&self, look: impl FnOnce(&View) -> T) -> Result<T, Error> {
         self.refresh().await?;
         Ok(look(self.rows.lock().await.fold()))
     }
@@ -130,7 +130,7 @@ impl Register {
     /// As decided; the store does not answer; nobody knows whether it was written.
     pub async fn decide<T>(&self, mut decide: impl FnMut(&View) -> Result<Decision<T>, Refusal>) -> Result<T, Refusal> {
         for _ in 0..TRIES {
-            let (item, answer) = self.look(&mut decide).await.map_err(unavailable)??;
+            let (item, answer) = self.ask(&mut decide).await.map_err(unavailable)??;
             let Some(item) = item else { return Ok(answer) };
             match self.store.commit(vec![item]).await.remove(0) {
                 Ok(_) => {
@@ -177,7 +177,7 @@ impl Register {
 /// An item that writes one record: new, or over the one that was looked at.
 pub fn written<R: Record>(record: &R, at: Option<Revision>, actor: impl Into<Actor>, kind: &'static str) -> Item {
     let mut item = Item::new(Writer::Identity, actor);
-    item.put(record, at.map_or(Expect::Absent, Expect::At), kind);
+    item.put_row(record, at.map_or(Expect::Absent, Expect::At), kind);
     item
 }
 
@@ -244,7 +244,7 @@ mod tests {
         store.commit(vec![item]).await.remove(0).expect("applied");
         let register = Register::new(store.clone(), clock);
         let directory = register.directory();
-        let known = async || register.look(|view| (view.tokens.len(), view.robots.len())).await.expect("rows");
+        let known = async || register.ask(|view| (view.tokens.len(), view.robots.len())).await.expect("rows");
         assert_eq!(known().await, (2, 2));
         assert_eq!(directory.borrow().tokens.len(), 2);
         let mut item = Item::new(Writer::Identity, "elsewhere");

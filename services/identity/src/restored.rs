@@ -107,12 +107,12 @@ pub fn put_right(rows: &[Row], list: &[Revocation], ending: Tokens, now: Utc) ->
     }
     for (id, (token, at)) in &view.tokens {
         if before.0.get(id).is_none_or(|(known, _)| known != token) {
-            item.put(token, at.map_or(Expect::Absent, Expect::At), "token.restored");
+            item.put_row(token, at.map_or(Expect::Absent, Expect::At), "token.restored");
         }
     }
     for (id, (robot, at)) in &view.robots {
         if before.1.get(id).is_none_or(|(known, _)| known != robot) {
-            item.put(robot, at.map_or(Expect::Absent, Expect::At), "robot.restored");
+            item.put_row(robot, at.map_or(Expect::Absent, Expect::At), "robot.restored");
         }
     }
     put_names_right(&view, now, &mut item);
@@ -126,7 +126,7 @@ fn put_names_right(view: &View, now: Utc, item: &mut Item) {
     for (token, _) in made.clone() {
         let name = TokenName { name: token.name.clone(), token_id: token.token_id.clone() };
         let known = view.names.get(&token.name).map(|(_, at)| *at);
-        item.put(&name, known.map_or(Expect::Absent, Expect::At), "token_name.taken");
+        item.put_row(&name, known.map_or(Expect::Absent, Expect::At), "token_name.taken");
     }
     for (name, at) in view.names.values() {
         let is_free = view.tokens.get(name.token_id.as_str()).is_some_and(|(token, _)| token.is_revoked(now));

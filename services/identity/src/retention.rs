@@ -40,7 +40,7 @@ async fn prune_tokens(store: &dyn Store, wall: Utc) -> Result<u64, Error> {
     loop {
         let page = store.list(query.clone()).await?;
         let is_last = page.len() < query.limit;
-        query.after = page.last().map(Cursor::of);
+        query.after = page.last().map(Cursor::of_row);
         for row in page {
             let is_newest = newest.iter().any(|newest| newest.key == row.key);
             match row.decode::<TokenRecord>() {
@@ -97,7 +97,7 @@ async fn prune_robots(store: &dyn Store, now: &Now) -> Result<u64, Error> {
             if let (true, Some(control)) = (is_spent, retired.get(&row.key.id)) {
                 let mut item = item();
                 // Still retired when it is written.
-                item.keep(control.key.clone(), Expect::At(control.revision));
+                item.keep_row(control.key.clone(), Expect::At(control.revision));
                 item.delete(row.key, row.revision, "robot.forgotten");
                 items.push(item);
             }

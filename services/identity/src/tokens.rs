@@ -90,7 +90,7 @@ impl Wanted {
         }
         let read = |(n, text): (usize, &String)| {
             let (field, grant) = (format!("grants[{n}]"), text.parse::<Grant>());
-            let grant = bad.take(&field, grant)?;
+            let grant = bad.accept(&field, grant)?;
             if matches!(grant, Grant { role: Role::Admin | Role::Auditor, scope: Scope::Area(_) }) {
                 let role = grant.role.as_str();
                 bad.add(field, format!("{grant} permits no more than viewer does: {role} is of the whole site"));
@@ -164,7 +164,7 @@ fn made(view: &View, record: &TokenRecord, by: &Actor, note: Note) -> Item {
     let mut item = decided(record, None, by, "token.created", note);
     let name = TokenName { name: record.name.clone(), token_id: record.token_id.clone() };
     let known = view.names.get(&record.name).map(|(_, at)| *at);
-    item.put(&name, known.map_or(Expect::Absent, Expect::At), "token_name.taken");
+    item.put_row(&name, known.map_or(Expect::Absent, Expect::At), "token_name.taken");
     item
 }
 
@@ -287,7 +287,7 @@ mod tests {
         for register in &processes {
             let record = everything().record(&draw(), &by, now);
             // Both look before either of them writes.
-            items.push(register.look(|view| created(view, &record, &by)).await.expect("rows"));
+            items.push(register.ask(|view| created(view, &record, &by)).await.expect("rows"));
         }
         let mut results = Vec::new();
         for item in items {

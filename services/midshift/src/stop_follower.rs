@@ -343,7 +343,7 @@ mod tests {
         let mut robot = RobotIdentity::new(robot_id.clone());
         let gone = async |robot: &RobotIdentity, expect: Expect, ms: i64| {
             let mut item = Item::new(Writer::Identity, "anna");
-            item.put(robot, expect, "robot.changed");
+            item.put_row(robot, expect, "robot.changed");
             assert!(store.commit(vec![item]).await.iter().all(Result::is_ok));
             let snapshot = store.snapshot(&[Table::RobotControl, Table::RobotIdentity]).await?;
             let now = Now { utc: Utc(ms), wall: Utc(ms), ..Now::default() };
@@ -365,7 +365,7 @@ mod tests {
         let mut robot = RobotIdentity::new(RobotId::parse("r1")?);
         robot.revoke("anna", Utc(1_000_000));
         let mut revoked = Item::new(Writer::Identity, "anna");
-        revoked.put(&robot, Expect::Absent, "robot.revoked");
+        revoked.put_row(&robot, Expect::Absent, "robot.revoked");
         let write = Write::Put { index: Index::default(), body: "{}".into() };
         let key = Key::new(Table::Session, "r1");
         let mut attached = Item::new(Writer::Telemetry, "tests");

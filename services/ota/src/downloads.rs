@@ -124,12 +124,12 @@ impl Downloads {
         self.must_be_enrolled(by).await?;
         let shown = self.shown()?;
         let mut bad = Violations::default();
-        let digest = bad.take("digest", r.digest.parse::<Digest>());
+        let digest = bad.accept("digest", r.digest.parse::<Digest>());
         if r.base_digests.len() > limits::ENCODING_BASES_MAX {
             bad.add("base_digests", format!("at most {}", limits::ENCODING_BASES_MAX));
         }
         let bases = r.base_digests.iter().take(limits::ENCODING_BASES_MAX);
-        let bases: Vec<Digest> = bases.filter_map(|base| bad.take("base_digests", base.parse())).collect();
+        let bases: Vec<Digest> = bases.filter_map(|base| bad.accept("base_digests", base.parse())).collect();
         bad.finish()?;
         let digest = digest.ok_or_else(|| Refusal::field("digest", "is required"))?;
         let file = self.listed(digest).await?;
@@ -150,7 +150,7 @@ impl Downloads {
         self.must_be_enrolled(by).await?;
         let shown = self.shown()?;
         let mut bad = Violations::default();
-        let digest = bad.take("digest", r.digest.parse::<Digest>());
+        let digest = bad.accept("digest", r.digest.parse::<Digest>());
         if !(1..=limits::CHUNK_RANGE_BYTES).contains(&r.length) {
             bad.add("length", format!("is required, 1..{}", limits::CHUNK_RANGE_BYTES));
         }

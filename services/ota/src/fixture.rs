@@ -99,7 +99,7 @@ pub fn key_set(number: u64, seeds: &[u8], by: u8) -> (String, Vec<u8>) {
 }
 
 pub fn target(name: &str, content: &[u8]) -> FileTarget {
-    FileTarget { name: name.to_owned(), digest: Digest::of(content), length: content.len() as u64 }
+    FileTarget { name: name.to_owned(), digest: Digest::of_content(content), length: content.len() as u64 }
 }
 
 /// The targets document after `previous` with these files more, signed by the key of `seed`.
@@ -172,7 +172,7 @@ impl Room {
     /// Brings files whole.
     pub async fn bring(&self, files: &[(String, Vec<u8>)]) {
         for (_, content) in files {
-            let file = Wanted { digest: Digest::of(content), length: content.len() as u64 };
+            let file = Wanted { digest: Digest::of_content(content), length: content.len() as u64 };
             if self.content.settle(file).await.expect("asked") != Held::Whole {
                 self.content.append(file, 0, Bytes::copy_from_slice(content)).await.expect("room");
                 assert_eq!(self.content.settle(file).await.expect("whole"), Held::Whole);
@@ -222,7 +222,7 @@ pub async fn service(dir: &TempDir) -> OtaService {
 pub async fn release(service: &OtaService, files: &[(String, Vec<u8>)]) {
     let opened = service.opened().expect("keys");
     for (_, content) in files {
-        let file = Wanted { digest: Digest::of(content), length: content.len() as u64 };
+        let file = Wanted { digest: Digest::of_content(content), length: content.len() as u64 };
         opened.content.append(file, 0, Bytes::copy_from_slice(content)).await.expect("room");
         opened.content.settle(file).await.expect("whole");
     }

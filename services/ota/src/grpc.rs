@@ -20,7 +20,7 @@ use tonic::{Request, Response, Status, Streaming};
 /// Which file a request means, and everything that is wrong with that.
 fn wanted(digest: &str, length: u64) -> Result<Wanted, Refusal> {
     let mut bad = Violations::default();
-    let digest = bad.take("digest", digest.parse::<Digest>());
+    let digest = bad.accept("digest", digest.parse::<Digest>());
     if length == 0 {
         bad.add("length", format!("is required, 1..{COMPONENT_BYTES_MAX}"));
     }

@@ -46,7 +46,7 @@ async fn prune_rollouts(store: &dyn Store) -> Result<u64, Error> {
     loop {
         let page = store.list(query.clone()).await?;
         let is_last = page.len() < query.limit;
-        query.after = page.last().map(Cursor::of);
+        query.after = page.last().map(Cursor::of_row);
         let stay = limits::ROLLOUTS_MAX.saturating_sub(seen);
         seen += page.len();
         let beyond: Vec<Row> = page.into_iter().skip(stay).collect();
@@ -76,7 +76,7 @@ async fn forget_rollout(store: &dyn Store, rollout: Row) -> Result<u64, Error> {
         if is_last {
             item.delete(rollout.key.clone(), rollout.revision, "rollout.forgotten");
         } else {
-            item.keep(rollout.key.clone(), Expect::At(rollout.revision));
+            item.keep_row(rollout.key.clone(), Expect::At(rollout.revision));
         }
         let rows = aged::commit(store, item).await?;
         gone += rows;
@@ -112,7 +112,7 @@ async fn old_bundles(store: &dyn Store, now: &Now) -> Result<Vec<(Bundle, Row)>,
     loop {
         let page = store.list(query.clone()).await?;
         let is_last = page.len() < query.limit;
-        query.after = page.last().map(Cursor::of);
+        query.after = page.last().map(Cursor::of_row);
         let bundles = page.into_iter().filter_map(|row| Some((row.decode::<Bundle>().ok()?, row)));
         old.extend(bundles.filter(|(bundle, _)| is_past(bundle, now)));
         if is_last {

@@ -212,7 +212,7 @@ mod tests {
         let walk = files("walk", "1.0.0");
         release(&service, &walk).await;
         let opened = service.opened().expect("keys");
-        let stray = midshift_bundle::digest::Digest::of(b"stray");
+        let stray = midshift_bundle::digest::Digest::of_content(b"stray");
         opened.content.append(Wanted { digest: stray, length: 5 }, 0, "stray".into()).await.expect("room");
         opened.content.settle(Wanted { digest: stray, length: 5 }).await.expect("whole");
         let site = Arc::new(midshift_core::site::text::parse(midshift_core::site::DEMO).expect("the demo reads"));
@@ -238,7 +238,7 @@ mod tests {
         let passes = limits::COLLECT_EVERY_MS + unnamed_ms;
         assert!((passes..passes + 2 * limits::COLLECT_EVERY_MS).contains(&took_ms), "{took_ms} ms");
         for (name, content) in &walk {
-            let digest = midshift_bundle::digest::Digest::of(content);
+            let digest = midshift_bundle::digest::Digest::of_content(content);
             assert!(opened.content.length(digest).await.expect("asked").is_some(), "{name}");
         }
         shutdown.cancel();
@@ -252,7 +252,7 @@ mod tests {
         let service = service(&dir).await;
         let stray = b"brought and never signed";
         let opened = service.opened().expect("keys");
-        let file = Wanted { digest: midshift_bundle::digest::Digest::of(stray), length: stray.len() as u64 };
+        let file = Wanted { digest: midshift_bundle::digest::Digest::of_content(stray), length: stray.len() as u64 };
         opened.content.append(file, 0, bytes::Bytes::from_static(stray)).await.expect("room");
         opened.content.settle(file).await.expect("whole");
         let refusal = opened.downloads.listed(file.digest).await.expect_err("nobody signed it");

@@ -71,7 +71,7 @@ impl Site {
     async fn bring(&self, first: &[u8], version: &str) -> Result<Vec<u8>, Error> {
         let (opened, more) = (self.opened(), files("walk", version));
         for (_, content) in &more {
-            let digest = midshift_bundle::digest::Digest::of(content);
+            let digest = midshift_bundle::digest::Digest::of_content(content);
             let file = crate::content::Wanted { digest, length: content.len() as u64 };
             if opened.content.length(digest).await?.is_none() {
                 opened.content.append(file, 0, bytes::Bytes::copy_from_slice(content)).await?;

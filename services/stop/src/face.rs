@@ -65,8 +65,8 @@ impl StreamingService<v1::AttendRequest> for Attend {
     type Future = BoxFuture<Response<Down>, Status>;
 
     fn call(&mut self, request: Request<Streaming<v1::AttendRequest>>) -> Self::Future {
-        let (inner, by, leaving) = (self.0.clone(), caller(&request), Leaving::of(&request));
-        let denying = Denying::of(&request);
+        let (inner, by, leaving) = (self.0.clone(), caller(&request), Leaving::from_request(&request));
+        let denying = Denying::from_request(&request);
         Box::pin(async move { line::attend(inner, &by, leaving, &denying, request.into_inner()).await })
     }
 }

@@ -34,7 +34,7 @@ fn wanted(r: v1::EngageRequest, by: &Caller) -> Result<Wanted, Refusal> {
     }
     let request_id = match r.request_id.as_str() {
         "" => None,
-        text => bad.take("request_id", RequestId::parse(text)),
+        text => bad.accept("request_id", RequestId::parse(text)),
     };
     let scope: Option<Scope> = match &r.scope {
         Some(scope) => scope.clone().parse_at(At::top("scope"), &mut bad),
@@ -94,7 +94,7 @@ impl StopService {
     async fn take_back(&self, r: v1::ResetRequest, by: &Caller) -> Result<v1::ResetResponse, Refusal> {
         self.is_meant(&r.site_id)?;
         let mut bad = Violations::default();
-        let stop_id = bad.take("stop_id", StopId::parse(&r.stop_id));
+        let stop_id = bad.accept("stop_id", StopId::parse(&r.stop_id));
         if r.reason.trim().is_empty() || r.reason.len() > limits::REASON_BYTES_MAX {
             bad.add(
                 "reason",

@@ -37,8 +37,9 @@ pub async fn attend(
     mut up: Streaming<v1::AttendRequest>,
 ) -> Result<Response<Down>, Status> {
     let begun = begin(&inner, by, &mut up).await;
-    let (robot, outbox) =
-        begun.inspect_err(|refusal| denying.tell(refusal)).map_err(|refusal| midshift_proto::status(&refusal, None))?;
+    let (robot, outbox) = begun
+        .inspect_err(|refusal| denying.report(refusal))
+        .map_err(|refusal| midshift_proto::status(&refusal, None))?;
     let down = Down::new(inner.clone(), outbox.clone());
     tokio::spawn(async move {
         hold(&inner, &robot, &outbox, &leaving, up).await;

@@ -75,7 +75,7 @@ async fn forget_robot(store: &dyn Store, writer: Writer, control: Row) -> Result
     }
     let mut item = Item::new(writer, writer.as_str());
     // Still retired when it is written.
-    item.keep(control.key, Expect::At(control.revision));
+    item.keep_row(control.key, Expect::At(control.revision));
     for row in rows.into_iter().filter(|row| row.key.table.writer() == writer).take(SLICE) {
         item.delete(row.key, row.revision, "robot.forgotten");
     }

@@ -43,7 +43,7 @@ impl<T: Send + Sync + 'static> LiveBoard<T> {
     }
 
     /// Replaces what is known of a robot.
-    pub fn put(&self, robot_id: &RobotId, live: Arc<T>) {
+    pub fn publish(&self, robot_id: &RobotId, live: Arc<T>) {
         self.set(robot_id, Some(live));
     }
 
@@ -117,7 +117,7 @@ pub struct Dirty<T> {
 
 impl<T: Send + Sync + 'static> Dirty<T> {
     /// The robots that changed since the last call, longest unchanged first, each once with its newest value; `None` = forgotten.
-    pub fn take(&mut self) -> Vec<(RobotId, Option<Arc<T>>)> {
+    pub fn take_changed(&mut self) -> Vec<(RobotId, Option<Arc<T>>)> {
         let robots = self.board.robots();
         let range = (Bound::Excluded(self.seen), Bound::Unbounded);
         let changed = robots.by_number.range(range).map(|(_, id)| {
@@ -150,34 +150,34 @@ mod tests {
         let board = LiveBoard::new();
         let mut slow = board.watch();
         let mut quick = board.watch();
-        board.put(&robot("a"), Arc::new(1));
-        assert_eq!(quick.take(), [(robot("a"), Some(Arc::new(1)))]);
-        board.put(&robot("b"), Arc::new(2));
-        board.put(&robot("a"), Arc::new(3));
-        assert_eq!(quick.take(), [(robot("b"), Some(Arc::new(2))), (robot("a"), Some(Arc::new(3)))]);
-        assert_eq!(slow.take(), [(robot("b"), Some(Arc::new(2))), (robot("a"), Some(Arc::new(3)))]);
-        assert!(slow.take().is_empty());
+        board.publish(&robot("a"), Arc::new(1));
+        assert_eq!(quick.take_changed(), [(robot("a"), Some(Arc::new(1)))]);
+        board.publish(&robot("b"), Arc::new(2));
+        board.publish(&robot("a"), Arc::new(3));
+        assert_eq!(quick.take_changed(), [(robot("b"), Some(Arc::new(2))), (robot("a"), Some(Arc::new(3)))]);
+        assert_eq!(slow.take_changed(), [(robot("b"), Some(Arc::new(2))), (robot("a"), Some(Arc::new(3)))]);
+        assert!(slow.take_changed().is_empty());
     }
 
     #[test]
     fn a_late_watcher_starts_with_the_whole_board_and_sees_a_robot_go() {
         let board = LiveBoard::new();
-        board.put(&robot("a"), Arc::new(1));
+        board.publish(&robot("a"), Arc::new(1));
         let mut late = board.watch();
-        assert_eq!(late.take().len(), 1);
+        assert_eq!(late.take_changed().len(), 1);
         board.remove(&robot("a"));
-        assert_eq!(late.take(), [(robot("a"), None)]);
+        assert_eq!(late.take_changed(), [(robot("a"), None)]);
         assert!(board.all().is_empty());
     }
 
     #[tokio::test]
     async fn a_watcher_that_has_seen_all_waits_for_the_next_change() {
         let board = LiveBoard::new();
-        board.put(&robot("a"), Arc::new(1));
+        board.publish(&robot("a"), Arc::new(1));
         let mut watcher = board.watch();
         watcher.changed().await;
-        watcher.take();
-        let (_, ()) = tokio::join!(watcher.changed(), async { board.put(&robot("b"), Arc::new(2)) });
-        assert_eq!(watcher.take(), [(robot("b"), Some(Arc::new(2)))]);
+        watcher.take_changed();
+        let (_, ()) = tokio::join!(watcher.changed(), async { board.publish(&robot("b"), Arc::new(2)) });
+        assert_eq!(watcher.take_changed(), [(robot("b"), Some(Arc::new(2)))]);
     }
 }

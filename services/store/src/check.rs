@@ -134,7 +134,7 @@ pub(crate) fn decide(
             Write::Put { index, body } => (index, Some(body)),
             Write::Delete => (Index::default(), None),
         };
-        let entry = entry(seq, Log::of(writer), key.id.clone(), kind, body.clone());
+        let entry = entry(seq, Log::of_writer(writer), key.id.clone(), kind, body.clone());
         decided.entries.push(Entry { table: Some(key.table), revision, index: index.clone(), ..entry });
         match body {
             Some(body) => {

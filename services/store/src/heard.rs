@@ -1,6 +1,6 @@
 //! The newest heartbeat of each robot, where several processes must know it: gateways keep it, everybody reads what is new.
 //!
-//! Invariant: what [`HeardLog::keep`] has answered is what every later reader sees, and an item with
+//! Invariant: what [`HeardLog::append`] has answered is what every later reader sees, and an item with
 //! [`midshift_core::rows::Silent`] is applied only if nothing of its robot was kept after the position that it names. So whoever
 //! gives a robot's work to another knows everything that the robot relies on. Bodies are not decoded here.
 //!
@@ -33,7 +33,7 @@ pub struct Heard {
     pub body: Arc<str>,
 }
 
-/// What became of a call of [`HeardLog::keep`].
+/// What became of a call of [`HeardLog::append`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Kept {
     /// Newest number of the store's feed at that moment: what was decided before is up to here.
@@ -46,7 +46,7 @@ pub struct Kept {
 #[async_trait]
 pub trait HeardLog: Send + Sync + 'static {
     /// Keeps heartbeats of different robots, each unless a newer session of its robot was heard; durable on return.
-    async fn keep(&self, heard: Vec<Heard>) -> Result<Kept, Error>;
+    async fn append(&self, heard: Vec<Heard>) -> Result<Kept, Error>;
     /// The newest position; 0: nothing was ever kept.
     async fn position(&self) -> Result<u64, Error>;
     /// Robots heard after a position, each with its newest, and the position read up to.
@@ -92,7 +92,7 @@ async fn read_newest(
             Ok(told) => {
                 let before = board.get(&one.robot_id);
                 if let Some(live) = told.into_live(&one.robot_id, before.as_deref(), now) {
-                    board.put(&one.robot_id, Arc::new(live));
+                    board.publish(&one.robot_id, Arc::new(live));
                 }
             }
             Err(error) => {
@@ -124,7 +124,7 @@ impl MemoryHeard {
 
 #[async_trait]
 impl HeardLog for MemoryHeard {
-    async fn keep(&self, heard: Vec<Heard>) -> Result<Kept, Error> {
+    async fn append(&self, heard: Vec<Heard>) -> Result<Kept, Error> {
         let mut fenced = Vec::new();
         {
             let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);

@@ -39,11 +39,11 @@ impl Rows {
     }
 
     pub(crate) fn insert(&mut self, row: Row) {
-        let place = Cursor::of(&row);
+        let place = Cursor::of_row(&row);
         let index = row.index.clone();
         match self.rows.insert(row.key.id.clone(), row) {
             Some(old) if old.index == index => return,
-            Some(old) => self.unlink(&Cursor::of(&old), &old.index),
+            Some(old) => self.unlink(&Cursor::of_row(&old), &old.index),
             None => {}
         }
         if let Some(parent) = index.parent {
@@ -57,7 +57,7 @@ impl Rows {
 
     pub(crate) fn delete(&mut self, id: &str) {
         if let Some(old) = self.rows.remove(id) {
-            self.unlink(&Cursor::of(&old), &old.index);
+            self.unlink(&Cursor::of_row(&old), &old.index);
         }
     }
 

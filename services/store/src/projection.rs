@@ -136,6 +136,7 @@ impl<F: Fold> Projection<F> {
 
 /// The logs that changes of the fold's tables are in.
 fn logs<F: Fold>() -> Vec<Log> {
-    let writers = F::tables().iter().flat_map(|table| [Log::of(table.writer()), Log::of(table.born_by())]);
+    let writers =
+        F::tables().iter().flat_map(|table| [Log::of_writer(table.writer()), Log::of_writer(table.born_by())]);
     writers.collect::<BTreeSet<_>>().into_iter().collect()
 }

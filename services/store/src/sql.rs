@@ -142,7 +142,7 @@ pub(crate) fn list(query: &Query, state: Option<i64>) -> String {
 pub(crate) fn merged(query: &Query, mut rows: Vec<Row>) -> Vec<Row> {
     match query.id_prefix {
         Some(_) => rows.sort_by(|a, b| a.key.id.cmp(&b.key.id)),
-        None => rows.sort_by_cached_key(Cursor::of),
+        None => rows.sort_by_cached_key(Cursor::of_row),
     }
     if query.newest_first {
         rows.reverse();

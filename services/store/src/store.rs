@@ -150,7 +150,7 @@ pub struct Cursor {
 
 impl Cursor {
     /// Where `row` stands.
-    pub fn of(row: &Row) -> Self {
+    pub fn of_row(row: &Row) -> Self {
         Self { order: row.index.order.unwrap_or(i64::MIN), id: row.key.id.clone() }
     }
 }

@@ -52,7 +52,7 @@ pub(crate) fn reason_text(text: &str, bad: &mut Violations) {
 }
 
 pub(crate) fn request_id(text: &str, bad: &mut Violations) -> Option<RequestId> {
-    if text.is_empty() { None } else { bad.take("request_id", RequestId::parse(text)) }
+    if text.is_empty() { None } else { bad.accept("request_id", RequestId::parse(text)) }
 }
 
 pub(crate) fn hash(verb: &str, message: &impl Message) -> String {
@@ -88,7 +88,7 @@ impl TaskService {
     /// Asks for the end of a task.
     pub async fn cancel(&self, r: v1::CancelTaskRequest, by: &Caller) -> Result<v1::CancelTaskResponse, Refusal> {
         let mut bad = Violations::default();
-        let task_id = bad.take("task_id", TaskId::parse(&r.task_id));
+        let task_id = bad.accept("task_id", TaskId::parse(&r.task_id));
         reason_text(&r.reason, &mut bad);
         let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
@@ -124,7 +124,7 @@ impl TaskService {
     /// A person's answer to NEEDS_OPERATOR.
     pub async fn resolve(&self, r: v1::ResolveTaskRequest, by: &Caller) -> Result<v1::ResolveTaskResponse, Refusal> {
         let mut bad = Violations::default();
-        let task_id = bad.take("task_id", TaskId::parse(&r.task_id));
+        let task_id = bad.accept("task_id", TaskId::parse(&r.task_id));
         reason_text(&r.reason, &mut bad);
         let request_id = request_id(&r.request_id, &mut bad);
         let resolution = Resolution::from_wire(r.resolution);

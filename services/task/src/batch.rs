@@ -120,7 +120,7 @@ impl<'a> Batch<'a> {
                     },
                 },
             };
-            let outcome = outcome.inspect_err(|refusal| self.denying.tell(refusal));
+            let outcome = outcome.inspect_err(|refusal| self.denying.report(refusal));
             let notes = match &outcome {
                 // The task is durable, whether or not the rows of its robot can be read now.
                 Ok(Durable::New(intake)) => self.service.notes(&intake.spec).await.unwrap_or_default(),

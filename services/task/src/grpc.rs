@@ -64,14 +64,14 @@ impl Face for TaskService {
 
     async fn submit_task(&self, r: Request<v1::SubmitTaskRequest>) -> Result<Response<v1::SubmitTaskResponse>, Status> {
         let id = CallId::of_request(&r, &r.get_ref().request_id);
-        let (by, denying) = (caller(&r), Denying::of(&r));
-        id.answer(self.submit(r.into_inner(), &by).await.inspect_err(|refusal| denying.tell(refusal)))
+        let (by, denying) = (caller(&r), Denying::from_request(&r));
+        id.answer(self.submit(r.into_inner(), &by).await.inspect_err(|refusal| denying.report(refusal)))
     }
     async fn submit_tasks(
         &self,
         r: Request<Streaming<v1::SubmitTasksRequest>>,
     ) -> Result<Response<v1::SubmitTasksResponse>, Status> {
-        let (id, by, denying) = (CallId::of_request(&r, ""), caller(&r), Denying::of(&r));
+        let (id, by, denying) = (CallId::of_request(&r, ""), caller(&r), Denying::from_request(&r));
         let results = Batch::new(self, &by, denying).run(r.into_inner()).await.map_err(|broken| match broken {
             Broken::Stream(status) => status,
             Broken::Refused(refusal) => id.status(&refusal),

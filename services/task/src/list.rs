@@ -114,7 +114,7 @@ impl TaskService {
                     }
                     tasks.push(task.encode());
                 }
-                after = Some(Cursor::of(row));
+                after = Some(Cursor::of_row(row));
             }
         }
         Ok(v1::ListTasksResponse { tasks, next_page_token: go_on(after.as_ref()), rows_read: rows_read as u64 })

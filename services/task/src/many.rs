@@ -173,7 +173,7 @@ impl TaskService {
                 Query { after, limit: limits::PAGE_MAX, ..Query::all(Table::TaskState).in_states(phases.clone()) };
             let rows = self.store().list(query).await.map_err(unavailable)?;
             let Some(last) = rows.last() else { break };
-            after = Some(Cursor::of(last));
+            after = Some(Cursor::of_row(last));
             let ids: Vec<TaskId> = rows.iter().filter_map(|row| TaskId::parse(&row.key.id).ok()).collect();
             let mut tasks = read_many(self.store(), &ids).await?;
             let site = &self.inner.parts.site;

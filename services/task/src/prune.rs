@@ -43,7 +43,7 @@ impl TaskService {
         let (mut after, mut gone) = (None, 0);
         while gone < limits::FORGOTTEN_PER_PASS as u64 {
             let page = self.store().list(Query { after, limit: SLICE, ..Query::all(Table::TaskIntake) }).await?;
-            let Some(last) = page.last().map(Cursor::of) else { break };
+            let Some(last) = page.last().map(Cursor::of_row) else { break };
             after = Some(last);
             let read = page.len();
             let old = |row: &Row| row.decode::<TaskIntake>().is_ok_and(|intake| intake.created < before);

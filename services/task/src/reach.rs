@@ -68,7 +68,7 @@ impl TaskService {
             let query = Query { after, limit: limits::PAGE_MAX, ..Query::all(Place::TABLE) };
             let rows = self.store().list(query).await.map_err(unavailable)?;
             let Some(last) = rows.last() else { return Ok(areas) };
-            after = Some(Cursor::of(last));
+            after = Some(Cursor::of_row(last));
             for row in &rows {
                 let place: Place = row.decode().map_err(unavailable)?;
                 for holder in &place.holders {

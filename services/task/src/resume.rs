@@ -59,7 +59,7 @@ impl Named {
 
 /// What a request names, if it names anything.
 fn read(r: &v1::ResumeHeldRequest, is_area: impl Fn(&AreaId) -> bool, bad: &mut Violations) -> Ask {
-    let area_id = if r.area_id.is_empty() { None } else { bad.take("area_id", AreaId::parse(&r.area_id)) };
+    let area_id = if r.area_id.is_empty() { None } else { bad.accept("area_id", AreaId::parse(&r.area_id)) };
     if area_id.as_ref().is_some_and(|area| !is_area(area)) {
         bad.add("area_id", "the site has no such area");
     }
@@ -68,9 +68,9 @@ fn read(r: &v1::ResumeHeldRequest, is_area: impl Fn(&AreaId) -> bool, bad: &mut 
         bad.add("task_ids", "at most 1000 task_ids and 1000 robot_ids");
     }
     let tasks = r.task_ids.iter().enumerate();
-    let task_ids = tasks.filter_map(|(i, id)| bad.take(&format!("task_ids[{i}]"), TaskId::parse(id))).collect();
+    let task_ids = tasks.filter_map(|(i, id)| bad.accept(&format!("task_ids[{i}]"), TaskId::parse(id))).collect();
     let robots = r.robot_ids.iter().enumerate();
-    let robot_ids = robots.filter_map(|(i, id)| bad.take(&format!("robot_ids[{i}]"), RobotId::parse(id))).collect();
+    let robot_ids = robots.filter_map(|(i, id)| bad.accept(&format!("robot_ids[{i}]"), RobotId::parse(id))).collect();
     let stop_id = Some(r.stop_id.clone()).filter(|id| !id.is_empty());
     if stop_id.is_none() && r.area_id.is_empty() && r.task_ids.is_empty() && r.robot_ids.is_empty() {
         bad.add("stop_id", "name a stop_id, an area_id, task_ids or robot_ids: nothing is resumed by accident");
@@ -173,7 +173,7 @@ impl TaskService {
             let query = Query { after, ..Query::all(HoldToken::TABLE) };
             let rows = self.store().list(query).await.map_err(unavailable)?;
             let Some(last) = rows.last() else { return Ok(held) };
-            after = Some(Cursor::of(last));
+            after = Some(Cursor::of_row(last));
             for row in &rows {
                 let HoldToken { robot_id, token, .. } = row.decode().map_err(unavailable)?;
                 let is_named = named.robot_ids.is_empty() || named.robot_ids.contains(&robot_id);

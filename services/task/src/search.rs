@@ -84,7 +84,7 @@ impl Search {
             Source::States(states) => store.list(query.in_states(states.iter().copied())).await?,
         };
         if let Some(last) = rows.last() {
-            self.after = Some(Cursor::of(last));
+            self.after = Some(Cursor::of_row(last));
         }
         Ok(rows)
     }
@@ -128,7 +128,7 @@ async fn of_robots(store: &dyn Store, robots: &mut [OfRobot], query: &Query) -> 
     let mut rows = Vec::new();
     while robots.iter().all(|robot| robot.is_read || !robot.ahead.is_empty()) {
         let next = robots.iter_mut().filter(|robot| !robot.ahead.is_empty());
-        let place = |robot: &&mut OfRobot| robot.ahead.front().map(Cursor::of);
+        let place = |robot: &&mut OfRobot| robot.ahead.front().map(Cursor::of_row);
         let next = if query.newest_first { next.max_by_key(place) } else { next.min_by_key(place) };
         let Some(row) = next.and_then(|robot| robot.ahead.pop_front()) else { break };
         rows.push(row);

@@ -143,7 +143,7 @@ impl Events {
             item.facts.push(fact(robot_id, &entry));
         }
         let expect = if self.revision == Revision(0) { Expect::Absent } else { Expect::At(self.revision) };
-        item.put(&mark, expect, "lane.durable");
+        item.put_row(&mark, expect, "lane.durable");
         Some(Batch { mark, item })
     }
     /// The batch is durable.

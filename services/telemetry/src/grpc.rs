@@ -325,8 +325,8 @@ impl Watching<'_> {
     }
     /// Those that changed since the last call.
     fn changed(&mut self) -> Vec<RobotId> {
-        let beats = self.beats.take().into_iter().map(|(id, _)| id);
-        let ids: BTreeSet<RobotId> = beats.chain(self.touched.take().into_iter().map(|(id, _)| id)).collect();
+        let beats = self.beats.take_changed().into_iter().map(|(id, _)| id);
+        let ids: BTreeSet<RobotId> = beats.chain(self.touched.take_changed().into_iter().map(|(id, _)| id)).collect();
         ids.into_iter().collect()
     }
 }

@@ -35,7 +35,8 @@ impl LinkService for TelemetryService {
     ) -> Result<Response<Self::SessionStream>, Status> {
         let (down, stream) = mpsc::channel(DOWN_MAX);
         let service = self.clone();
-        let (by, leaving, denying) = (caller(&request), Leaving::of(&request), Denying::of(&request));
+        let (by, leaving, denying) =
+            (caller(&request), Leaving::from_request(&request), Denying::from_request(&request));
         let up = request.into_inner();
         tokio::spawn(async move {
             let shutdown = service.inner.shutdown.clone();
@@ -43,7 +44,7 @@ impl LinkService for TelemetryService {
                 () = down.closed() => {}
                 result = service.hold(&by, leaving, up, down.clone()) => {
                     if let Err(refusal) = &result {
-                        denying.tell(refusal);
+                        denying.report(refusal);
                     }
                     if let Err(refusal) = result
                         && !shutdown.is_cancelled()

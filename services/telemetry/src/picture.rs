@@ -124,7 +124,7 @@ impl Picture {
     }
     /// Says that something other than its newest heartbeat changed about a robot.
     pub fn touch(&self, robot_id: &RobotId) {
-        self.touched.put(robot_id, Arc::new(()));
+        self.touched.publish(robot_id, Arc::new(()));
     }
     /// A watcher of what changes otherwise than by heartbeats.
     pub fn touched(&self) -> Dirty<()> {

@@ -43,7 +43,7 @@ async fn read(store: &dyn Store) -> Option<Known> {
     loop {
         let rows = store.list(query.clone()).await.ok()?;
         let Some(last) = rows.last() else { return Some(known) };
-        query.after = Some(midshift_store::Cursor::of(last));
+        query.after = Some(midshift_store::Cursor::of_row(last));
         for row in &rows {
             if let Ok(robot_id) = RobotId::parse(&row.key.id) {
                 known.insert(robot_id, (row.decode::<PresenceRow>().ok(), row.revision));
@@ -102,7 +102,7 @@ async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: Lin
         let mut item = Item::new(Writer::Telemetry, "telemetry");
         for (row, revision) in rows {
             let expect = if *revision == Revision(0) { Expect::Absent } else { Expect::At(*revision) };
-            item.put(row, expect, "presence.changed");
+            item.put_row(row, expect, "presence.changed");
         }
         items.push(item);
     }

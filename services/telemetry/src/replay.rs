@@ -31,12 +31,12 @@ impl ReplayService for TelemetryService {
         &self,
         request: Request<ReplayStatusRequest>,
     ) -> Result<Response<ReplayStatusResponse>, Status> {
-        let (by, denying) = (caller(&request), Denying::of(&request));
+        let (by, denying) = (caller(&request), Denying::from_request(&request));
         let ack = match parse(request.into_inner()) {
             Ok(replay) => self.hand_over(&by, replay).await,
             Err(refusal) => Err(refusal),
         };
-        ack.inspect_err(|refusal| denying.tell(refusal))
+        ack.inspect_err(|refusal| denying.report(refusal))
             .map(|ack| Response::new((&ack).into()))
             .map_err(|refusal| status(&refusal, None))
     }

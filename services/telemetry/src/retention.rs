@@ -32,7 +32,7 @@ async fn prune_marks(store: &dyn Store, wall: Utc) -> Result<u64, Error> {
         let page = store.list(query).await?;
         let Some(last) = page.last() else { return Ok(gone) };
         let is_last = !is_old(last);
-        after = Some(Cursor::of(last));
+        after = Some(Cursor::of_row(last));
         let mut item = Item::new(Writer::Telemetry, "telemetry");
         for row in page.into_iter().take_while(is_old) {
             if is_replaced(store, &row).await? {

@@ -371,7 +371,7 @@ impl Session {
         let echo = Echo { hb, clock, is_clock_doubted };
         match &self.inner.shared {
             None => {
-                self.inner.parts.board.put(&self.robot_id, live);
+                self.inner.parts.board.publish(&self.robot_id, live);
                 self.change_out(|out| out.echo = Some(echo));
             }
             Some(shared) => {

@@ -124,7 +124,7 @@ async fn write(log: &dyn HeardLog, batch: &BTreeMap<RobotId, Waiting>) -> Result
         return log.position().await.map(|_| None);
     }
     let begun = Instant::now();
-    let kept = log.keep(batch.values().map(|waiting| Heard::from(waiting.live.as_ref())).collect()).await?;
+    let kept = log.append(batch.values().map(|waiting| Heard::from(waiting.live.as_ref())).collect()).await?;
     metrics::histogram!("midshift_telemetry_heartbeat_commit_seconds").record(begun.elapsed().as_secs_f64());
     Ok(Some(kept))
 }
@@ -133,7 +133,7 @@ async fn write(log: &dyn HeardLog, batch: &BTreeMap<RobotId, Waiting>) -> Result
 async fn publish_kept(board: &LiveBoard<Live>, picture: &Picture, batch: BTreeMap<RobotId, Waiting>, kept: &Kept) {
     let (fenced, heard): (Vec<_>, Vec<_>) = batch.into_values().partition(|w| kept.fenced.contains(&w.live.robot_id));
     for waiting in &heard {
-        board.put(&waiting.live.robot_id, waiting.live.clone());
+        board.publish(&waiting.live.robot_id, waiting.live.clone());
     }
     for waiting in fenced {
         // A session that does not read has ended, or hears it with its next heartbeat.

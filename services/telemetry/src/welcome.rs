@@ -108,7 +108,7 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
         let enrolled_unix_ms = robot.as_ref().and_then(|robot| robot.enrolled_unix_ms);
         let session = Session { clock_offset_ms, enrolled_unix_ms, ..session_row(hello, session_epoch, &said) };
         let mut item = Item::new(Writer::Telemetry, hello.robot_id.as_str());
-        item.put(&session, row.map_or(Expect::Absent, |(_, revision)| Expect::At(revision)), "session.begun");
+        item.put_row(&session, row.map_or(Expect::Absent, |(_, revision)| Expect::At(revision)), "session.begun");
         match store.commit(vec![item]).await.pop() {
             Some(Ok(_)) => {}
             Some(Err(CommitError::Conflict { .. })) => continue,

@@ -76,11 +76,11 @@ impl Line {
                 message = down.message() => {
                     let message = message.map_err(|status| ended(&status))?.ok_or(End::Own)?;
                     let now = self.clock.now();
-                    self.player().hear(message, now.link.0)?;
+                    self.player().receive(message, now.link.0)?;
                 }
                 _ = tick.tick() => {
                     let now = self.clock.now();
-                    let said = self.player().say(now.link.0, now.wall.0);
+                    let said = self.player().due_messages(now.link.0, now.wall.0);
                     for message in said {
                         up.try_send(message).map_err(|_| End::Own)?;
                     }

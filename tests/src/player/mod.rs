@@ -286,7 +286,7 @@ impl Player {
     ///
     /// # Errors
     /// How the server ended it.
-    pub fn hear(&mut self, message: v1::SessionResponse, now_ms: u64) -> Result<(), End> {
+    pub fn receive(&mut self, message: v1::SessionResponse, now_ms: u64) -> Result<(), End> {
         let message = midshift_proto::parse::<ToRobot, _>(message).map_err(|bad| End::Unread(format!("{bad:?}")))?;
         match message {
             ToRobot::Welcome(welcome) => self.welcomed(welcome),
@@ -342,7 +342,7 @@ impl Player {
     // --- what it says
 
     /// What it says at `now_ms` of its own clock.
-    pub fn say(&mut self, now_ms: u64, unix_ms: i64) -> Vec<v1::SessionRequest> {
+    pub fn due_messages(&mut self, now_ms: u64, unix_ms: i64) -> Vec<v1::SessionRequest> {
         if now_ms < self.quiet_until {
             return Vec::new();
         }

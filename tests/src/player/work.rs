@@ -109,7 +109,7 @@ impl Player {
             opened: false,
         });
         self.job = Some(Job { assignment, step, due: now_ms + 500 });
-        self.tell(WorkState::Accepted);
+        self.report_work(WorkState::Accepted);
         if self.shows(Habit::FallsSilent, 0.7) {
             self.quiet_until = now_ms + self.rng.random_range(2_000..45_000);
         }
@@ -150,7 +150,7 @@ impl Player {
         if let Some(listed) = self.listed() {
             (listed.step_index, listed.progress, listed.opened) = (next, listed.progress + 1, listed.opened || opens);
         }
-        if next >= end { self.end(WorkState::Succeeded) } else { self.tell(WorkState::Executing) }
+        if next >= end { self.end(WorkState::Succeeded) } else { self.report_work(WorkState::Executing) }
     }
     /// It is in the places of its way one after the other, and stays in the last.
     fn arrived(&mut self) {
@@ -187,7 +187,7 @@ impl Player {
         let attempt = self.job.as_ref().map(|job| job.assignment.attempt.clone())?;
         self.state.attempts.iter_mut().find(|listed| listed.attempt == attempt)
     }
-    fn tell(&mut self, state: WorkState) {
+    fn report_work(&mut self, state: WorkState) {
         let Some(listed) = self.listed() else { return };
         listed.state = state;
         let report = report_of(&listed.attempt, state, listed.step_index, listed.opened);

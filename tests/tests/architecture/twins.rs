@@ -205,7 +205,7 @@ fn the_program_of_the_stop_service_has_no_store_in_it() {
 
 #[test]
 fn no_source_of_a_program_switches_a_naive_rule_on() {
-    let switches = |text: &str| text.contains("Bugs::of(") || text.contains("SeededBug::");
+    let switches = |text: &str| text.contains("Bugs::seeded(") || text.contains("SeededBug::");
     for file in sources().into_iter().filter(|file| file != "core/src/bugs.rs") {
         assert!(!switches(&code(&read(&file))), "{file}");
     }

@@ -226,7 +226,7 @@ impl Arena {
     // --- laws that hold all the time
 
     /// Looks at everything once; `playing` behave badly meanwhile.
-    pub async fn look(&mut self, playing: &BTreeSet<String>) -> anyhow::Result<()> {
+    pub async fn look_around(&mut self, playing: &BTreeSet<String>) -> anyhow::Result<()> {
         let tasks = self.alive().await?;
         for task in self.unmoved(&tasks) {
             self.is_explained(&task).await?;

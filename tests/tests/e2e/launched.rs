@@ -83,13 +83,13 @@ impl Machine {
     /// A set with these settings in the robot's folder.
     fn stage(&self, version: &str, behaviour: &str) -> anyhow::Result<SetManifest> {
         let mut sets = DiskSets::open(&self.path("sets"))?;
-        let wanted = Wanted { digest: Digest::of(behaviour.as_bytes()), length: behaviour.len() as u64 };
+        let wanted = Wanted { digest: Digest::of_content(behaviour.as_bytes()), length: behaviour.len() as u64 };
         sets.write(&wanted, 0, behaviour.as_bytes())?;
         sets.sync(&wanted)?;
         sets.seal(&wanted)?;
         let component = Component::new("behaviour", version, ComponentKind::Config, behaviour.as_bytes());
         let set = SetManifest {
-            bundle: Some(Digest::of(version.as_bytes())),
+            bundle: Some(Digest::of_content(version.as_bytes())),
             version: format!("walk {version}"),
             components: [(component.name.clone(), component)].into(),
         };
@@ -106,7 +106,7 @@ impl Machine {
     async fn remember(&self, set: &SetManifest, state: UpdateState) -> anyhow::Result<()> {
         let update = Update {
             state,
-            bundle: Digest::of(b"bundle"),
+            bundle: Digest::of_content(b"bundle"),
             manifest_length: 1,
             rollback_floor: 0,
             set: Some(set.clone()),

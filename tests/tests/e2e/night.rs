@@ -98,7 +98,7 @@ enum Stay {
 }
 
 impl Stay {
-    fn put(self, address: &str, id: &str, stands: bool) -> anyhow::Result<()> {
+    fn apply(self, address: &str, id: &str, stands: bool) -> anyhow::Result<()> {
         match self {
             Self::Freeze => {
                 let frozen = if stands { "true" } else { "false" };
@@ -472,7 +472,7 @@ impl Night {
             Ok(self.rows(id).await?.filter(|rows| is_amid(rows, had, left)).map(drop))
         })
         .await?;
-        stay.put(&self.address, id, true)?;
+        stay.apply(&self.address, id, true)?;
         let from_ms = now_ms();
         // The item that permits relies on what was just said: who has no permission now gets none.
         let rows = until("its robots", LIMIT, async || self.rows(id).await).await?;
@@ -488,7 +488,7 @@ impl Night {
         let to_ms = now_ms();
         let after = permitted(&until("its robots", LIMIT, async || self.rows(id).await).await?);
         ensure!(after.is_subset(&before), "{stay:?} of {id}: {before:?} had permission, and now {after:?}");
-        stay.put(&self.address, id, false)?;
+        stay.apply(&self.address, id, false)?;
         let had = before.len();
         self.holds.push(Hold { what: format!("{stay:?}"), version, from_ms, to_ms, permitted: before });
         Ok(had)

@@ -237,10 +237,10 @@ impl Serving {
 
     /// A page of ten; what was read for it.
     async fn list(&self, filter: TaskFilter) -> anyhow::Result<(Vec<String>, usize)> {
-        self.counted.take();
+        self.counted.take_count();
         let request = ListTasksRequest { filter: Some(filter), page_size: 10, page_token: String::new() };
         let page = tasks(self.address)?.list_tasks(request).await?.into_inner();
-        Ok((page.tasks.into_iter().map(|task| task.task_id).collect(), self.counted.take()))
+        Ok((page.tasks.into_iter().map(|task| task.task_id).collect(), self.counted.take_count()))
     }
 }
 
@@ -260,7 +260,7 @@ async fn is_looked_up_by_index(serving: &Serving) -> anyhow::Result<()> {
     ensure!(prefixed.0.len() == 10 && prefixed.0.iter().all(|id| id.starts_with("old-1999")), "{:?}", prefixed.0);
     let one = serving.list(named.clone()).await?;
     ensure!(one.0 == [task_id(1).to_string()], "{:?}", one.0);
-    serving.counted.take();
+    serving.counted.take_count();
     let request = WatchTasksRequest { filter: None, cursor: String::new() };
     let mut watch = tasks(serving.address)?.watch_tasks(request).await?.into_inner();
     let mut existing = 0;
@@ -271,11 +271,11 @@ async fn is_looked_up_by_index(serving: &Serving) -> anyhow::Result<()> {
         }
     }
     ensure!(existing == 1, "a watch begins with what is alive, not with {existing}");
-    let watched = serving.counted.take();
+    let watched = serving.counted.take_count();
     let before = task_summary::newest_number(&*serving.counted).await?;
     let of_others = task_summary::read_once(serving.counted.clone(), "dev-", before).await?.of_others();
     ensure!(of_others == 1, "a run's client knows of what is alive, not of {of_others}");
-    let tallied = serving.counted.take();
+    let tallied = serving.counted.take_count();
     let read = [
         ("all", all.1),
         ("a robot's", of_robot.1),
@@ -293,7 +293,7 @@ async fn starts_and_answers(engine: Engine) -> anyhow::Result<()> {
     let old = Old::copy(engine).await?;
     let serving = Serving::start(&old).await?;
     serving.plans("new-1").await?;
-    let read = serving.counted.take();
+    let read = serving.counted.take_count();
     say!("{engine:?}: a start and a first plan read {read} rows");
     ensure!(read <= READ_BY_A_START, "a start and a first plan read {read} rows");
     is_looked_up_by_index(&serving).await?;
@@ -331,7 +331,7 @@ async fn whoever_takes_an_old_site_of_postgresql_over_reads_a_few_rows() -> anyh
     drop(leads._planning);
     leads.storage.close().await;
     standby.plans("new-2").await?;
-    let read = standby.counted.take();
+    let read = standby.counted.take_count();
     say!("a takeover reads {read} rows");
     ensure!(read <= READ_BY_A_START, "a takeover reads {read} rows");
     standby.end().await
@@ -344,12 +344,12 @@ async fn is_pruned(engine: Engine) -> anyhow::Result<()> {
     let counted = Counted::over(storage.store());
     let early: Arc<dyn Clock> = clock(1000);
     midshift_fleet::prune(&*counted, &*early).await?;
-    let read = counted.take();
+    let read = counted.take_count();
     ensure!(read <= READ_BY_A_START, "{read} rows are read where nothing is due");
     // Two days on, those of the first day are older than a month.
     let later = at(Utc(wall().0 + 2 * DAY_MS), 1000);
     let gone = midshift_fleet::prune(&*counted, &*later).await?;
-    let read = counted.take();
+    let read = counted.take_count();
     let due = ended()? / 29;
     say!("{engine:?}: {gone} rows went and {read} were read, of {due} tasks");
     ensure!((due / 2..due * 6).contains(&gone), "{gone} rows went, of {due} tasks");

@@ -123,7 +123,7 @@ async fn arena(seeds: Range<u64>) -> anyhow::Result<(BTreeMap<&'static str, u64>
                 looks += 1;
                 arena.ask().await?;
                 let (playing, gone) = { let p = lock(&players); (p.playing.clone(), p.gone.clone()) };
-                arena.look(&playing).await?;
+                arena.look_around(&playing).await?;
                 if looks % LOOKS_PER_ROUND == 0 {
                     arena.look_after(&gone).await?;
                 }
@@ -135,7 +135,7 @@ async fn arena(seeds: Range<u64>) -> anyhow::Result<(BTreeMap<&'static str, u64>
     // What is still open then is a finding, with its name.
     while !arena.look_after(&gone).await? && tokio::time::Instant::now() < end {
         look.tick().await;
-        arena.look(&BTreeSet::new()).await?;
+        arena.look_around(&BTreeSet::new()).await?;
     }
     let ends = std::mem::take(&mut lock(&players).ends);
     ends.iter().for_each(|(robot_id, ends)| arena.ended(robot_id, ends));

@@ -83,7 +83,7 @@ impl Room {
             boot_id: format!("boot-{name}"),
             new_ring_id: format!("ring-{name}"),
             seed: 1,
-            bugs: Bugs::of(bugs),
+            bugs: Bugs::seeded(bugs),
             pulse: None,
         };
         let uri = format!("https://{address}");

@@ -18,7 +18,7 @@ const PRINTS: [[&str; 2]; 3] = [["token", "create"], ["robot", "enroll"], ["robo
 
 type Known = Mutex<BTreeMap<String, &'static str>>;
 
-fn keep(known: &Known, what: &'static str, text: &str) {
+fn remember(known: &Known, what: &'static str, text: &str) {
     known.lock().unwrap_or_else(PoisonError::into_inner).insert(text.to_owned(), what);
 }
 
@@ -29,12 +29,12 @@ fn told(known: &Known, text: &str) -> Vec<&'static str> {
 
 /// From now on no program may have written `secret` into its log when it ends, and no command may print it.
 pub fn keep_secret(what: &'static str, secret: &str) {
-    keep(&SECRETS, what, secret);
+    remember(&SECRETS, what, secret);
 }
 
 /// From now on no program may have written these words of a person into its log when it ends.
 pub fn keep_from_logs(what: &'static str, words: &str) {
-    keep(&WORDS, what, words);
+    remember(&WORDS, what, words);
 }
 
 /// What of a token or an enrolment nobody may know: its third part.

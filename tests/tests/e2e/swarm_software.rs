@@ -160,11 +160,11 @@ fn trust(made: &Made, keys: &Path, hall: &FleetConfig) -> anyhow::Result<Trust> 
 impl Bench {
     /// With all samples.
     async fn open() -> anyhow::Result<Self> {
-        Self::of(|dir| Ok(samples::make(dir, None, Signer::Throwaway, BEGIN)?)).await
+        Self::make_with(|dir| Ok(samples::make(dir, None, Signer::Throwaway, BEGIN)?)).await
     }
 
     /// With what is made in a folder.
-    async fn of(make: impl FnOnce(&Path) -> anyhow::Result<Made>) -> anyhow::Result<Self> {
+    async fn make_with(make: impl FnOnce(&Path) -> anyhow::Result<Made>) -> anyhow::Result<Self> {
         let dir = tempfile::tempdir()?;
         let start = tokio::time::Instant::now();
         let clock: Arc<dyn Clock> =
@@ -236,7 +236,7 @@ impl Bench {
             robot_id: self.hall.robots()[0].robot_id().clone(),
             key_id: key.public().id(),
             generation: self.directives,
-            manifest: Digest::of(&bytes),
+            manifest: Digest::of_content(&bytes),
             manifest_length: bytes.len() as u64,
             rollback_floor: 0,
             issued_at: BEGIN,
@@ -294,14 +294,14 @@ impl Bench {
                     self.epoch += 1;
                     self.installed = Some(installed::open(&hello.installed, &hello.robot_id, &hello.boot_id)?);
                     self.note(hello.reported.update);
-                    self.say(ToRobot::Welcome(welcome(self.epoch))).await?;
+                    self.send(ToRobot::Welcome(welcome(self.epoch))).await?;
                 }
                 Some(FromRobot::Uplink(uplink)) => {
                     let acks = uplink.batches.iter().filter_map(|batch| self.heard(batch)).collect();
                     if let Some(heartbeat) = uplink.heartbeat {
                         return self.answer(&heartbeat, acks, directive).await;
                     }
-                    self.say(ToRobot::Downlink(Box::new(Downlink { acks, ..Downlink::default() }))).await?;
+                    self.send(ToRobot::Downlink(Box::new(Downlink { acks, ..Downlink::default() }))).await?;
                 }
             }
         }
@@ -362,11 +362,11 @@ impl Bench {
         };
         let echo = Some(Echo { hb, clock: ClockSample::default(), is_clock_doubted: false });
         let down = Downlink { echo, acks, work: Some(work), update: Some(update), ..Downlink::default() };
-        self.say(ToRobot::Downlink(Box::new(down))).await
+        self.send(ToRobot::Downlink(Box::new(down))).await
     }
 
     /// A robot that has gone meanwhile hears nothing.
-    async fn say(&mut self, message: ToRobot) -> anyhow::Result<()> {
+    async fn send(&mut self, message: ToRobot) -> anyhow::Result<()> {
         let seen = self.session.as_ref().context("no session")?;
         if seen.down.send(Ok(v1::SessionResponse::from(&message))).await.is_err() {
             self.session = None;
@@ -485,7 +485,7 @@ fn long_releases(dir: &Path) -> anyhow::Result<Made> {
 
 #[tokio::test(start_paused = true)]
 async fn a_release_that_was_signed_with_a_patch_from_the_one_before_is_installed_by_the_patch() -> anyhow::Result<()> {
-    let mut bench = Bench::of(long_releases).await?;
+    let mut bench = Bench::make_with(long_releases).await?;
     let [first, second] = [bench.way(None, 0)?, bench.way(None, 1)?];
     let patch = bench.way(Some(0), 1)?;
     // All that came: documents and what leads them too.

@@ -79,11 +79,11 @@ impl Agent {
         loop {
             tokio::time::sleep(pause).await;
             let life = self.lives.fetch_add(1, Relaxed);
-            self.observer.look().restarted(self.body.robot_id());
+            self.observer.lock().restarted(self.body.robot_id());
             let start = self.launched.start(&self.body, self.time.site())?;
-            self.tell()?;
+            self.send_status()?;
             let Start::Runs { hangs_after } = start else {
-                self.observer.look().count("program died at its start");
+                self.observer.lock().count("program died at its start");
                 pause = self.launched.pause();
                 continue;
             };
@@ -101,7 +101,7 @@ impl Agent {
     }
 
     /// The witness looks at what is started.
-    fn tell(&self) -> anyhow::Result<()> {
+    fn send_status(&self) -> anyhow::Result<()> {
         let holdings = self.launched.holdings()?;
         let running = holdings.set(holdings.switch.running());
         self.observer.starts(self.body.robot_id(), &holdings.switch, running.as_ref());
@@ -145,14 +145,14 @@ impl Agent {
             ended = &mut agent => match ended? {
                 ExitReason::Switched => return Ok(Ended::Switched),
                 end => {
-                    self.observer.look().find(format!("the agent of {robot_id} ended: {end:?}"));
+                    self.observer.lock().find(format!("the agent of {robot_id} ended: {end:?}"));
                     std::future::pending::<()>().await;
                 }
             },
             () = hang => {}
         }
         // It is left where it is, with its connection, until its launcher kills it.
-        self.observer.look().count("program hung");
+        self.observer.lock().count("program hung");
         tokio::time::sleep(Duration::from_secs(HANG_SECONDS)).await;
         Ok(Ended::Killed)
     }

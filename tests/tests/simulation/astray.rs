@@ -111,7 +111,7 @@ fn two_on_trial(seed: u64) -> (Scene, Vec<usize>) {
         spec.soak = seconds(1_500);
     });
     scene.until("both on trial", |room| {
-        let mut seen = room.observer.look();
+        let mut seen = room.observer.lock();
         let on_trial = |robot: &usize| {
             seen.changes().state(&room.hall.robots()[*robot].robot_id().clone()) == Some(UpdateState::Trial)
         };
@@ -168,7 +168,7 @@ fn never_reaches_its_server(seed: u64, alone: bool) -> (Scene, usize) {
     // It is heard before the others, which tell nothing of the network while they come back.
     steer(&mut scene.room, canary, Way::Open);
     scene.until("the server to hear it", |room| {
-        let seen = room.observer.look().changes().rollout("first").cloned();
+        let seen = room.observer.lock().changes().rollout("first").cloned();
         seen.is_some_and(|row| row.phase.is_over() || row.pauses.is_empty())
     });
     cut.iter().for_each(|robot| steer(&mut scene.room, *robot, Way::Open));
@@ -223,7 +223,7 @@ fn a_bundle_that_is_bad_only_with_a_load_touches_no_more_than_its_canaries_and_t
         scene.work(12);
         next_ms = scene.room.now_ms().max(next_ms) + 60_000;
         scene.until("the roll-out to go back, or a minute to pass", |room| {
-            let row = room.observer.look().changes().rollout("bad").map(|row| row.phase.goes_back());
+            let row = room.observer.lock().changes().rollout("bad").map(|row| row.phase.goes_back());
             goes_back = row == Some(true);
             goes_back || room.now_ms() >= next_ms
         });

@@ -47,10 +47,10 @@ pub struct Scene {
 
 impl Scene {
     pub fn open(seed: u64, robots: usize) -> Self {
-        Self::of(seed, robots, Naive::default())
+        Self::from_seed(seed, robots, Naive::default())
     }
     /// With naive rules.
-    pub fn of(seed: u64, robots: usize, naive: Naive) -> Self {
+    pub fn from_seed(seed: u64, robots: usize, naive: Naive) -> Self {
         Self::with(config(seed, robots, naive))
     }
     /// One robot's machine is not there yet.
@@ -71,7 +71,7 @@ impl Scene {
     }
     pub fn until(&mut self, what: &str, done: impl FnMut(&mut Room) -> bool) {
         if let Err(error) = self.room.until(what, PATIENCE_MS, done) {
-            let mut seen = self.room.observer.look();
+            let mut seen = self.room.observer.lock();
             let rows: Vec<String> = seen
                 .changes()
                 .rollouts()
@@ -124,25 +124,25 @@ impl Scene {
         self.order(Order::Begin { id: id.to_owned(), spec: Box::new(spec), supersede });
         let begun = id.to_owned();
         self.until("the roll-out to begin", move |room| {
-            room.observer.look().changes().rollout(&begun).is_some_and(|row| row.started.is_some())
+            room.observer.lock().changes().rollout(&begun).is_some_and(|row| row.started.is_some())
         });
     }
     pub fn row(&self, id: &str) -> Rollout {
-        self.room.observer.look().changes().rollout(id).expect("was written down").clone()
+        self.room.observer.lock().changes().rollout(id).expect("was written down").clone()
     }
     pub fn comes_to(&mut self, id: &str, phase: Phase) {
         let what = format!("{id} to come to {phase:?}");
-        self.until(&what, |room| room.observer.look().changes().rollout(id).is_some_and(|row| row.phase == phase));
+        self.until(&what, |room| room.observer.lock().changes().rollout(id).is_some_and(|row| row.phase == phase));
     }
     pub fn ends(&mut self, id: &str) -> Rollout {
         let what = format!("{id} to end");
-        self.until(&what, |room| room.observer.look().changes().rollout(id).is_some_and(|row| row.phase.is_over()));
+        self.until(&what, |room| room.observer.lock().changes().rollout(id).is_some_and(|row| row.phase.is_over()));
         self.row(id)
     }
     /// Everything has ended well: drains released, touched robots back.
     pub fn comes_to_rest(&mut self) {
         self.until("everything to come to rest", |room| {
-            room.observer.look().changes().ended().iter().all(|(_, holds, _)| *holds)
+            room.observer.lock().changes().ended().iter().all(|(_, holds, _)| *holds)
         });
     }
     /// So many tasks.
@@ -153,7 +153,7 @@ impl Scene {
     }
     /// Laws that were broken.
     pub fn findings(&self) -> Vec<String> {
-        self.room.observer.look().findings().to_vec()
+        self.room.observer.lock().findings().to_vec()
     }
     /// Robots whose ledger says this.
     pub fn robots_in(&self, state: UpdateState) -> Vec<usize> {
@@ -166,7 +166,7 @@ impl Scene {
     }
     pub fn runs(&self, robot: usize) -> Option<String> {
         let robot_id = self.room.robot_id(robot);
-        self.room.observer.look().changes().runs(&robot_id)
+        self.room.observer.lock().changes().runs(&robot_id)
     }
     pub fn bundle(&self, version: &str) -> Option<String> {
         Some(self.room.software.bundle(version).to_string())
@@ -178,12 +178,12 @@ impl Scene {
         }
     }
     pub fn activations(&self) -> u64 {
-        self.room.observer.look().checks().get("I18 no activation after the word to stand still").copied().unwrap_or(0)
+        self.room.observer.lock().checks().get("I18 no activation after the word to stand still").copied().unwrap_or(0)
     }
 }
 
 fn robots_in(room: &Room, robots: usize, state: UpdateState) -> Vec<usize> {
-    let mut seen = room.observer.look();
+    let mut seen = room.observer.lock();
     (0..robots).filter(|robot| seen.changes().state(&room.robot_id(*robot)) == Some(state)).collect()
 }
 
@@ -263,7 +263,7 @@ fn a_server_that_is_killed_in_any_phase_ends_the_roll_out_as_without() {
         scene.begin("killed", version, |spec| spec.exposure_tasks = Some(u64::from(waits_for_work)));
         // A way back is short: where nobody has to be waited for, it may be a phase further when it is seen.
         scene.until("the phase to be killed in", |room| {
-            let mut seen = room.observer.look();
+            let mut seen = room.observer.lock();
             let row = seen.changes().rollout("killed").map(|row| row.phase);
             row.is_some_and(|now| now == phase || (phase.goes_back() && now.goes_back()))
         });
@@ -273,7 +273,7 @@ fn a_server_that_is_killed_in_any_phase_ends_the_roll_out_as_without() {
             scene.order(Order::Promote("killed".to_owned()));
             scene.answered();
             scene.until("the next wave", |room| {
-                room.observer.look().changes().rollout("killed").is_some_and(|row| row.promoted == 1)
+                room.observer.lock().changes().rollout("killed").is_some_and(|row| row.promoted == 1)
             });
             scene.order(Order::Abort("killed".to_owned()));
             assert_eq!(scene.ends("killed").phase, Phase::Aborted);
@@ -306,7 +306,7 @@ fn a_roll_out_that_stands_still_goes_on_standing_when_its_server_was_killed() {
     scene.comes_to("killed", Phase::Applying);
     scene.order(Order::Pause("killed".to_owned()));
     let stands = |room: &mut Room| {
-        room.observer.look().changes().rollout("killed").is_some_and(|row| row.pauses.contains(&Pause::Operator))
+        room.observer.lock().changes().rollout("killed").is_some_and(|row| row.pauses.contains(&Pause::Operator))
     };
     scene.until("it to stand still", stands);
     kill(&mut scene);
@@ -384,7 +384,7 @@ fn an_access_point_that_is_lost_in_probation_stands_the_roll_out_still_and_burns
     }
     scene.until("the roll-out to stand still", |room| {
         let infrastructure = |row: &Rollout| row.pauses.contains(&Pause::Infrastructure);
-        room.observer.look().changes().rollout("unlucky").is_some_and(infrastructure)
+        room.observer.lock().changes().rollout("unlucky").is_some_and(infrastructure)
     });
     for robot in 0..6 {
         steer(&mut scene.room, robot, Way::Open);
@@ -416,7 +416,7 @@ fn a_pause_whose_answers_are_lost_holds_in_the_middle_of_a_wave_and_the_roll_out
     let mut scene = Scene::open(32, 4);
     scene.begin("paused", GOOD[0], |_| {});
     let holds = |room: &mut Room| {
-        let mut seen = room.observer.look();
+        let mut seen = room.observer.lock();
         (0..4).any(|robot| seen.changes().held_by(&room.hall.robots()[robot].robot_id().clone()).is_some())
     };
     scene.until("a robot in its drain", holds);
@@ -427,7 +427,7 @@ fn a_pause_whose_answers_are_lost_holds_in_the_middle_of_a_wave_and_the_roll_out
     }
     scene.order(Order::Pause("paused".to_owned()));
     scene.until("the pause to be committed", |room| {
-        room.observer.look().changes().rollout("paused").is_some_and(|row| row.pauses.contains(&Pause::Operator))
+        room.observer.lock().changes().rollout("paused").is_some_and(|row| row.pauses.contains(&Pause::Operator))
     });
     steer(&mut scene.room, 4, Way::Cut);
     scene.room.disk.set(Mood::GOOD);
@@ -454,7 +454,7 @@ fn a_new_roll_out_right_after_an_abort_brings_every_robot_to_its_own_bundle_in_i
     scene.begin("first", GOOD[0], |_| {});
     scene.until("a robot in its drain", |room| {
         let robots: Vec<_> = room.hall.robots().iter().map(|body| body.robot_id().clone()).collect();
-        let mut seen = room.observer.look();
+        let mut seen = room.observer.lock();
         robots.iter().any(|id| seen.changes().held_by(id).is_some())
     });
     scene.order(Order::Abort("first".to_owned()));
@@ -481,7 +481,7 @@ fn one_that_supersedes_another_waits_until_it_is_undone_and_then_brings_its_own(
 fn two_planners_on_one_store_give_nothing_twice() {
     for seed in 40..43 {
         // The lease would keep one of them from planning.
-        let rollouts = bugs::Bugs::of(&[bugs::SeededBug::EverybodyLeads]);
+        let rollouts = bugs::Bugs::seeded(&[bugs::SeededBug::EverybodyLeads]);
         let server = midshift::server::Naive { rollouts, ..Default::default() };
         let naive = Naive { server, ..Naive::default() };
         let mut scene = Scene::with(RoomConfig { planners: 2, ..config(seed, 5, naive) });
@@ -515,7 +515,7 @@ fn the_kept_set_is_always_the_one_committed_last_in_every_order_of_good_and_abor
                 let number = kept.len();
                 scene.until("the commit to be durable", |room| {
                     let robot_id = room.robot_id(0);
-                    let mut seen = room.observer.look();
+                    let mut seen = room.observer.lock();
                     seen.changes()
                         .record(&robot_id)
                         .is_some_and(|switch| switch.trial.is_none() && switch.number as usize >= number)
@@ -528,7 +528,7 @@ fn the_kept_set_is_always_the_one_committed_last_in_every_order_of_good_and_abor
             let newest = order.iter().rposition(|keeps| *keeps).expect("one was kept");
             scene.order(Order::Rollback { of: format!("r{newest}"), id: "back".to_owned() });
             scene.until("it to begin", |room| {
-                room.observer.look().changes().rollout("back").is_some_and(|r| r.started.is_some())
+                room.observer.lock().changes().rollout("back").is_some_and(|r| r.started.is_some())
             });
             assert_eq!(scene.ends("back").phase, Phase::Completed, "{order:?}");
             scene.comes_to_rest();
@@ -572,7 +572,7 @@ fn a_robot_that_comes_later_gets_the_bundle_of_its_area() {
     let wanted = scene.bundle(GOOD[0]);
     scene.until("the newcomer to run it", |room| {
         let robot_id = room.robot_id(3);
-        room.observer.look().changes().runs(&robot_id) == wanted
+        room.observer.lock().changes().runs(&robot_id) == wanted
     });
     scene.comes_to_rest();
 }

@@ -204,8 +204,8 @@ impl FrameLog for ServerFrames {
         self.inner.read(after, bytes_max).await
     }
     async fn report_gaps(&self, gaps: Vec<Gap>) -> Result<(), Error> {
-        if gaps.iter().any(|gap| !self.disk.observer.look().is_player(&gap.robot_id)) {
-            self.disk.observer.look().find(format!("I9 status in order, once, without gaps: {gaps:?}"));
+        if gaps.iter().any(|gap| !self.disk.observer.lock().is_player(&gap.robot_id)) {
+            self.disk.observer.lock().find(format!("I9 status in order, once, without gaps: {gaps:?}"));
         }
         self.inner.report_gaps(gaps).await
     }

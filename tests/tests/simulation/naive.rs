@@ -17,17 +17,17 @@ use midshift_proto::ota::v1::rollout_wave::Size;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 fn rollouts(bug: Rollouts) -> Naive {
-    Naive { server: Server { rollouts: RolloutBugs::of(&[bug]), ..Server::default() }, ..Naive::default() }
+    Naive { server: Server { rollouts: RolloutBugs::seeded(&[bug]), ..Server::default() }, ..Naive::default() }
 }
 
 fn agent(bug: SeededBug) -> Naive {
-    Naive { agent: Bugs::of(&[bug]), ..Naive::default() }
+    Naive { agent: Bugs::seeded(&[bug]), ..Naive::default() }
 }
 
 /// Leads the twin into its situation, and the real rule too: only the twin breaks the law.
 fn breaks(seed: u64, robots: usize, naive: Naive, law: &str, lead: impl Fn(&mut Scene)) {
     for (rule, is_broken) in [(Naive::default(), false), (naive, true)] {
-        let mut scene = Scene::of(seed, robots, rule);
+        let mut scene = Scene::from_seed(seed, robots, rule);
         let led = catch_unwind(AssertUnwindSafe(|| lead(&mut scene)));
         let found = scene.findings();
         assert_eq!(found.iter().any(|finding| finding.contains(law)), is_broken, "{law}: {found:#?}");
@@ -77,7 +77,7 @@ fn a_pause_that_is_forgotten_lets_robots_change_after_it() {
 #[test]
 fn any_drain_that_will_do_changes_robots_in_the_drain_of_somebody_else() {
     let law = "I19 a robot activates in the drain of its roll-out";
-    let naive = Naive { agent: Bugs::of(&[SeededBug::AnyDrainWillDo]), ..rollouts(Rollouts::AnyDrainWillDo) };
+    let naive = Naive { agent: Bugs::seeded(&[SeededBug::AnyDrainWillDo]), ..rollouts(Rollouts::AnyDrainWillDo) };
     breaks(62, 3, naive, law, |scene| {
         for robot in 0..3 {
             let robot_id = scene.room.robot_id(robot).to_string();
@@ -103,7 +103,7 @@ fn a_robot_that_activates_anyway_does_so_while_it_is_stopped() {
 #[test]
 fn an_area_whose_budget_is_forgotten_spares_too_many() {
     let law = "I17 no more change than the area spares";
-    let fleet = FleetBugs::of(&[Fleet::BudgetIsForgotten]);
+    let fleet = FleetBugs::seeded(&[Fleet::BudgetIsForgotten]);
     let naive = Naive { server: Server { fleet, ..Server::default() }, ..Naive::default() };
     breaks(64, 6, naive, law, |scene| {
         scene.begin("r", GOOD[0], |spec| {
@@ -118,8 +118,8 @@ fn an_area_whose_budget_is_forgotten_spares_too_many() {
 fn a_limit_of_the_wave_that_is_forgotten_changes_too_many() {
     let law = "I17 no more change than the wave has";
     // All robots are of one area, whose budget would hold them back.
-    let fleet = FleetBugs::of(&[Fleet::BudgetIsForgotten]);
-    let rollouts = RolloutBugs::of(&[Rollouts::InFlightIsForgotten]);
+    let fleet = FleetBugs::seeded(&[Fleet::BudgetIsForgotten]);
+    let rollouts = RolloutBugs::seeded(&[Rollouts::InFlightIsForgotten]);
     let naive = Naive { server: Server { fleet, rollouts, ..Server::default() }, ..Naive::default() };
     breaks(65, 10, naive, law, |scene| {
         scene.begin("r", GOOD[0], |spec| {

@@ -101,32 +101,32 @@ impl Shared {
         Self(Arc::new(Mutex::new(Observer::new(time, store))))
     }
     /// What it knows now.
-    pub fn look(&self) -> MutexGuard<'_, Observer> {
+    pub fn lock(&self) -> MutexGuard<'_, Observer> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
     /// Something was committed.
     pub fn committed(&self) {
-        self.look().committed();
+        self.lock().committed();
     }
     /// A robot's ledger was written.
     pub fn ledger(&self, robot_id: &RobotId, ops: &[Op]) {
-        self.look().ledger(robot_id, ops);
+        self.lock().ledger(robot_id, ops);
     }
     /// STATUS was stored.
     pub fn stored(&self, frames: &[Frame]) {
-        self.look().stored(frames);
+        self.lock().stored(frames);
     }
     /// A robot's switch record was written.
     pub fn switched(&self, robot_id: &RobotId, switch: &Switch, set: Option<&SetManifest>) {
-        self.look().switched(robot_id, switch, set, "switch record written");
+        self.lock().switched(robot_id, switch, set, "switch record written");
     }
     /// A robot is started from its switch record.
     pub fn starts(&self, robot_id: &RobotId, switch: &Switch, set: Option<&SetManifest>) {
-        self.look().switched(robot_id, switch, set, "program started");
+        self.lock().switched(robot_id, switch, set, "program started");
     }
     /// A body begins an action of a task.
     pub fn acts(&self, robot_id: &RobotId, task_id: &TaskId, step: &StepKind) {
-        self.look().acts(robot_id, task_id, step);
+        self.lock().acts(robot_id, task_id, step);
     }
 }
 

@@ -11,12 +11,12 @@ const AWAY_SAMPLES: u64 = AWAY_MS / 2_000 * 9 / 10;
 const UNDER_WAY: u64 = 5;
 
 fn backlog(scene: &Scene, robot: usize) -> u64 {
-    let (stored, produced) = scene.room.observer.look().status(&scene.room.robot_id(robot));
+    let (stored, produced) = scene.room.observer.lock().status(&scene.room.robot_id(robot));
     produced - stored
 }
 
 fn stored(scene: &Scene, robot: usize) -> u64 {
-    scene.room.observer.look().status(&scene.room.robot_id(robot)).0
+    scene.room.observer.lock().status(&scene.room.robot_id(robot)).0
 }
 
 /// Robot 0 was away and is back.
@@ -31,14 +31,14 @@ fn back(seed: u64) -> Scene {
 
 fn some_of_it_comes(scene: &mut Scene) {
     let (robot_id, before) = (scene.room.robot_id(0), stored(scene, 0));
-    scene.until("some of it", |room| room.observer.look().status(&robot_id).0 > before + 100);
+    scene.until("some of it", |room| room.observer.lock().status(&robot_id).0 > before + 100);
     assert!(backlog(scene, 0) > 100, "there is more");
 }
 
 fn all_of_it_comes(scene: &mut Scene) {
     let robot_id = scene.room.robot_id(0);
     scene.until("all of it", |room| {
-        let (stored, produced) = room.observer.look().status(&robot_id);
+        let (stored, produced) = room.observer.lock().status(&robot_id);
         produced - stored <= UNDER_WAY
     });
     // And it goes on live.

@@ -131,7 +131,7 @@ impl Game {
 
     fn run(mut self) -> Outcome {
         if let Err(error) = self.play() {
-            let mut seen = self.room.observer.look();
+            let mut seen = self.room.observer.lock();
             if seen.findings().is_empty() {
                 seen.find(format!("{error:#}"));
             }
@@ -143,7 +143,7 @@ impl Game {
             player.habits().iter().for_each(|habit| *planned.entry(habit.name()).or_insert(0) += 1);
             player.deeds().iter().for_each(|(name, n)| *hits.entry(*name).or_insert(0) += n);
         }
-        let seen = self.room.observer.look();
+        let seen = self.room.observer.lock();
         Outcome {
             findings: seen.findings().to_vec(),
             hash: seen.hash(),
@@ -160,7 +160,7 @@ impl Game {
         while self.room.now_ms() < play_ms {
             let round_ms = (self.room.now_ms() + LOOK_MS).min(play_ms);
             self.room.until("one round of the game", 2 * LOOK_MS, |room| room.now_ms() >= round_ms)?;
-            self.look();
+            self.check_robots();
         }
         for number in 0..self.players.len() {
             self.room.sim.crash(player_machine(number));
@@ -178,16 +178,16 @@ impl Game {
             let round_ms = self.room.now_ms() + LOOK_AFTER_MS;
             let mut is_over = false;
             self.room.until("one round", 2 * LOOK_AFTER_MS, |room| {
-                let all_over = room.observer.look().tasks().values().all(|t| t.phase.is_terminal());
+                let all_over = room.observer.lock().tasks().values().all(|t| t.phase.is_terminal());
                 is_over = room.desk.is_empty() && all_over;
                 is_over || room.now_ms() >= round_ms
             })?;
-            self.look();
+            self.check_robots();
             if is_over {
                 return Ok(());
             }
             if self.room.now_ms() >= end_ms {
-                let mut seen = self.room.observer.look();
+                let mut seen = self.room.observer.lock();
                 let open: Vec<_> = seen.tasks().values().filter(|t| !t.phase.is_terminal()).cloned().collect();
                 seen.find(format!("I8 every task ends: {} are open: {open:?}", open.len()));
                 return Ok(());
@@ -199,7 +199,7 @@ impl Game {
     fn look_after(&mut self) {
         self.asked += 1;
         let (places, tasks) = {
-            let seen = self.room.observer.look();
+            let seen = self.room.observer.lock();
             let theirs = |robot: &Option<RobotId>| robot.as_ref().is_some_and(|r| self.names.contains(r));
             let mine = |t: &&midshift_core::task::TaskState| {
                 let stuck = t.phase == Phase::NeedsOperator;
@@ -230,7 +230,7 @@ impl Game {
     fn judge(&self) {
         let verdict = self.room.hall.verdict();
         let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).judge().drops_by_task();
-        let mut seen = self.room.observer.look();
+        let mut seen = self.room.observer.lock();
         match verdict {
             Ok(verdict) => {
                 seen.check("I4 no step is done twice", verdict.steps_done_twice == 0, || format!("{verdict:?}"));
@@ -269,10 +269,10 @@ impl Game {
     }
 
     /// Laws of a moment.
-    fn look(&mut self) {
+    fn check_robots(&mut self) {
         let metrics = counted();
         let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).judge().drops_by_task();
-        let mut seen = self.room.observer.look();
+        let mut seen = self.room.observer.lock();
         incidents::are_open_and_few(&self.room.store, &mut seen);
         counted::nothing_stands_unexplained(&metrics, &mut seen);
         planned_once(&metrics, &mut seen);
@@ -291,7 +291,7 @@ impl Game {
     /// An honest robot that was given a task comes on with it.
     fn look_at_honest(&mut self) {
         let now_ms = self.room.now_ms();
-        let mut seen = self.room.observer.look();
+        let mut seen = self.room.observer.lock();
         let is_meant = |a: &&Attempt| a.attempt.subject.task_id().is_some() && !self.names.contains(&a.robot_id);
         let live: Vec<Attempt> = seen.live().filter(is_meant).cloned().collect();
         let mut stands = BTreeMap::new();

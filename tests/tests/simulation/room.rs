@@ -142,11 +142,11 @@ impl Room {
         let of_hall =
             FleetConfig { faults: config.faults, ..FleetConfig::new(site.clone(), config.robots, config.seed) };
         let hall = Arc::new(Fleet::open(&of_hall, &clock.now())?);
-        observer.look().watch_world(hall.worlds()[0].clone());
+        observer.lock().watch_world(hall.worlds()[0].clone());
         let wire = Wire::default();
         let software = Arc::new(Software::make(clock.now().wall, site.site_id().clone())?);
         let keys = software.trust.directive_keys.clone();
-        observer.look().changes().watch(keys, software.signed.clone(), hall.robots());
+        observer.lock().changes().watch(keys, software.signed.clone(), hall.robots());
         let stop = if config.stops { Some(Stops::open(&mut sim, &time, &site, config.robots)?) } else { None };
         let folder = stop.as_ref().map(Stops::folder);
         serve(&mut sim, &wall, &site, disk.clone(), frames, config, &wire, &software, folder);
@@ -173,7 +173,7 @@ impl Room {
             run_agent(&mut sim, agent);
         }
         for (number, player) in config.players.iter().enumerate() {
-            observer.look().behaves_badly(player.clone());
+            observer.lock().behaves_badly(player.clone());
             play(&mut sim, number, player, &time, &wire);
         }
         let desk = Rc::new(client::Desk::default());
@@ -212,12 +212,12 @@ impl Room {
         self.time.note(self.sim.elapsed());
         self.let_go();
         if self.now_ms().is_multiple_of(BODIES_MS) {
-            self.observer.look().bodies(self.hall.robots());
+            self.observer.lock().bodies(self.hall.robots());
         }
         if self.now_ms().is_multiple_of(PERSON_MS) {
             let observer = self.observer.clone();
             let live = move |task_id: &TaskId| {
-                let seen = observer.look();
+                let seen = observer.lock();
                 seen.tasks().get(task_id).is_some_and(|t| !t.phase.is_terminal() && t.phase != Phase::NeedsOperator)
             };
             self.hall.person_round(self.time.site(), &live);
@@ -229,7 +229,7 @@ impl Room {
         let end = self.now_ms() + limit_ms;
         while !done(self) {
             self.step()?;
-            anyhow::ensure!(self.observer.look().findings().is_empty(), "a law is broken");
+            anyhow::ensure!(self.observer.lock().findings().is_empty(), "a law is broken");
             anyhow::ensure!(self.now_ms() < end, "{} s passed in vain for: {what}", limit_ms / 1000);
         }
         Ok(())
@@ -240,7 +240,7 @@ impl Room {
         self.hall.robots()[robot].inject(now, Injected::HardwareStop(SiteDuration(lasts_ms)));
         self.stops[robot] = Some(now + SiteDuration(lasts_ms));
         let (robot_id, us) = (self.robot_id(robot), self.time.us());
-        self.observer.look().changes().stopped(&robot_id, Some(us));
+        self.observer.lock().changes().stopped(&robot_id, Some(us));
     }
     /// Its own safety system stops it now.
     pub fn is_stopped(&self, robot: usize) -> bool {
@@ -253,7 +253,7 @@ impl Room {
             if self.stops[robot].is_some_and(|until| until <= now) {
                 self.stops[robot] = None;
                 let robot_id = self.robot_id(robot);
-                self.observer.look().changes().stopped(&robot_id, None);
+                self.observer.lock().changes().stopped(&robot_id, None);
             }
         }
     }

@@ -119,7 +119,7 @@ impl Shift {
 
     fn run(mut self) -> Outcome {
         if let Err(error) = self.shift() {
-            let mut seen = self.room.observer.look();
+            let mut seen = self.room.observer.lock();
             if seen.findings().is_empty() {
                 seen.find(format!("{error:#}"));
             }
@@ -128,7 +128,7 @@ impl Shift {
         self.hits.extend(self.room.wire.hits());
         self.hits.insert("answer a client never got", self.room.desk.unanswered.get());
         self.hits.insert("status sent beside a session", replayed());
-        let seen = self.room.observer.look();
+        let seen = self.room.observer.lock();
         Outcome {
             findings: seen.findings().to_vec(),
             hash: seen.hash(),
@@ -145,7 +145,7 @@ impl Shift {
         while self.room.now_ms() <= quiet_ms {
             self.suffer();
             self.room.step()?;
-            anyhow::ensure!(self.room.observer.look().findings().is_empty(), "a law is broken");
+            anyhow::ensure!(self.room.observer.lock().findings().is_empty(), "a law is broken");
         }
         self.suffer();
         let ended = self.end();
@@ -165,7 +165,7 @@ impl Shift {
             let round_ms = self.room.now_ms() + LOOK_AFTER_MS;
             let mut is_over = false;
             self.room.until("one round", 2 * LOOK_AFTER_MS, |room| {
-                let mut seen = room.observer.look();
+                let mut seen = room.observer.lock();
                 let over = |p: Phase| p.is_terminal() || p == Phase::NeedsOperator;
                 is_over = room.desk.is_empty()
                     && seen.tasks().len() == tasks
@@ -195,7 +195,7 @@ impl Shift {
         let bound: BTreeSet<String> = self
             .room
             .observer
-            .look()
+            .lock()
             .tasks()
             .values()
             .filter(waits)
@@ -204,7 +204,7 @@ impl Shift {
             .collect();
         bound.into_iter().for_each(|robot_id| self.order(Order::Uncordon(robot_id)));
         let rollouts: Vec<String> =
-            self.room.observer.look().changes().rollouts().map(|r| r.rollout_id.to_string()).collect();
+            self.room.observer.lock().changes().rollouts().map(|r| r.rollout_id.to_string()).collect();
         rollouts.into_iter().for_each(|id| self.order(Order::Settle(id)));
     }
     fn order(&self, order: Order) {
@@ -213,7 +213,7 @@ impl Shift {
 
     /// I8: what is still open, in words.
     fn say_open(&self) {
-        let mut seen = self.room.observer.look();
+        let mut seen = self.room.observer.lock();
         let over = |p: Phase| p.is_terminal() || p == Phase::NeedsOperator;
         let open: Vec<String> = seen.tasks().values().filter(|t| !over(t.phase)).map(|t| format!("{t:?}")).collect();
         if seen.findings().is_empty() && open.is_empty() {
@@ -228,7 +228,7 @@ impl Shift {
         let verdict = self.room.hall.verdict()?;
         let refused = self.room.desk.refused.borrow();
         let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).judge().drops_by_task();
-        let mut seen = self.room.observer.look();
+        let mut seen = self.room.observer.lock();
         counted::nothing_stands_unexplained(&counted::counted(), &mut seen);
         incidents::nobody_is_blamed(&self.room.store, &mut seen);
         seen.check("I8 every task ends", true, String::new);
@@ -338,7 +338,7 @@ impl Shift {
     fn count(&mut self, fault: &Fault) {
         let mut hits = Vec::new();
         {
-            let mut seen = self.room.observer.look();
+            let mut seen = self.room.observer.lock();
             let rolls = seen.changes().rollouts().any(|r| r.started.is_some() && !r.phase.is_over());
             match fault {
                 Fault::AgentCrash { robot, .. } => {

@@ -15,9 +15,9 @@ const TWIN_SEEDS: u64 = 40;
 
 /// The naive rule of this name; of an empty one: none.
 pub fn naive_of(name: &str) -> Naive {
-    let agent = |bug| Naive { agent: Bugs::of(&[bug]), ..Naive::default() };
+    let agent = |bug| Naive { agent: Bugs::seeded(&[bug]), ..Naive::default() };
     let server = |server| Naive { server, ..Naive::default() };
-    let fleet = |bug| server(Server { fleet: midshift_core::fleet::bugs::Bugs::of(&[bug]), ..Server::default() });
+    let fleet = |bug| server(Server { fleet: midshift_core::fleet::bugs::Bugs::seeded(&[bug]), ..Server::default() });
     match name {
         "" => Naive::default(),
         "silence_frees_task" => fleet(Fleet::SilenceFreesTask),
@@ -33,7 +33,7 @@ pub fn naive_of(name: &str) -> Naive {
         "authority_from_receipt" => agent(SeededBug::AuthorityFromReceipt),
         "grant_from_receipt" => agent(SeededBug::GrantFromReceipt),
         "ack_before_commit" => {
-            let telemetry = midshift_telemetry::Bugs::of(&[midshift_telemetry::SeededBug::AckBeforeCommit]);
+            let telemetry = midshift_telemetry::Bugs::seeded(&[midshift_telemetry::SeededBug::AckBeforeCommit]);
             server(Server { telemetry, ..Server::default() })
         }
         other => panic!("no naive rule is called {other}"),

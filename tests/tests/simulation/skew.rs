@@ -156,19 +156,19 @@ impl Shift {
     fn judge(&mut self) {
         let scene = &mut self.scene;
         scene.until("every task to end", |room| {
-            let seen = room.observer.look();
+            let seen = room.observer.lock();
             let tasks = seen.tasks();
             room.desk.is_empty() && tasks.len() == 2 * TASKS && tasks.values().all(|task| task.phase.is_terminal())
         });
         let drops = lock(&scene.room.hall.worlds()[0]).judge().drops_by_task();
-        for task in scene.room.observer.look().tasks().values() {
+        for task in scene.room.observer.lock().tasks().values() {
             let done = (task.phase, drops.get(&task.task_id).copied());
             assert_eq!(done, (TaskPhase::Succeeded, Some(1)), "{:?}: {task:?}", self.pair);
         }
         let verdict = scene.room.hall.verdict().expect("the journals are in memory");
         assert!(verdict.items_conserved(), "{:?}: {verdict:?}", self.pair);
         assert_eq!((verdict.steps_done_twice, verdict.exclusion_violations), (0, 0), "{:?}: {verdict:?}", self.pair);
-        scene.room.observer.look().changes_ended();
+        scene.room.observer.lock().changes_ended();
         let refused = scene.room.desk.refused.borrow().clone();
         assert_eq!((scene.findings(), refused), (Vec::new(), Vec::new()), "{:?}", self.pair);
     }

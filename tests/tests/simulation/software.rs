@@ -85,8 +85,8 @@ impl Software {
         for (version, behaviour) in releases {
             let manifest = manifest_of(version, behaviour.as_bytes());
             let (bytes, content) = (manifest.to_bytes(), behaviour.as_bytes().to_vec());
-            signed.insert(Digest::of(&bytes), BTreeSet::from([Digest::of(&content)]));
-            bundles.insert(version.to_owned(), BundleId::parse(&Digest::of(&bytes).to_string())?);
+            signed.insert(Digest::of_content(&bytes), BTreeSet::from([Digest::of_content(&content)]));
+            bundles.insert(version.to_owned(), BundleId::parse(&Digest::of_content(&bytes).to_string())?);
             files.push((manifest.components[0].target(), content));
             files.push((manifest.target(), bytes));
         }
@@ -94,7 +94,7 @@ impl Software {
             .iter()
             .map(|(name, bytes)| FileTarget {
                 name: name.clone(),
-                digest: Digest::of(bytes),
+                digest: Digest::of_content(bytes),
                 length: bytes.len() as u64,
             })
             .collect();
@@ -117,7 +117,7 @@ impl Software {
         let content =
             DiskContent::open(&self.folder().join("content"), Room::with_quota(limits::SOFTWARE_BYTES_DEFAULT))?;
         for (_, bytes) in files {
-            let file = Wanted { digest: Digest::of(&bytes), length: bytes.len() as u64 };
+            let file = Wanted { digest: Digest::of_content(&bytes), length: bytes.len() as u64 };
             content.append(file, 0, bytes.into()).await?;
             content.settle(file).await?;
         }

@@ -50,7 +50,7 @@ fn stops(room: &Room) -> &Stops {
 }
 
 impl Watch {
-    fn look(&mut self, room: &Room) {
+    fn check_room(&mut self, room: &Room) {
         let (now, now_ms) = (room.time.site(), room.now_ms());
         self.since.resize(ROBOTS, None);
         self.at.resize(ROBOTS, None);
@@ -90,7 +90,7 @@ impl Stopped {
         let watch = &mut self.watch;
         self.scene.until(what, |room| {
             if room.now_ms().is_multiple_of(100) {
-                watch.look(room);
+                watch.check_room(room);
             }
             done(room)
         });
@@ -260,7 +260,7 @@ fn a_reset_takes_one_stop_away_everywhere_and_no_other_and_a_rule_that_clears_al
     let real = one_of_two_is_reset(Naive::default());
     assert_eq!(real.effective().len(), 1);
     real.assert_agrees();
-    let naive = Naive { agent: Bugs::of(&[SeededBug::ResetClearsAll]), ..Naive::default() };
+    let naive = Naive { agent: Bugs::seeded(&[SeededBug::ResetClearsAll]), ..Naive::default() };
     let twin = one_of_two_is_reset(naive);
     assert_eq!(twin.effective().len(), 1);
     assert!(twin.known().iter().all(BTreeSet::is_empty), "robots forgot what nobody reset: {:?}", twin.known());

@@ -16,7 +16,7 @@ const BEGUN: [usize; 2] = [2, 3];
 
 /// Sessions that robots began so far.
 fn sessions(scene: &Scene) -> u64 {
-    scene.room.observer.look().counts().get("session begun").copied().unwrap_or(0)
+    scene.room.observer.lock().counts().get("session begun").copied().unwrap_or(0)
 }
 
 /// A shift of robots that have all had an update, so that they know what time it is; two soak in a second one. The server looks at its documents, once a
@@ -63,7 +63,7 @@ fn a_server_whose_wall_is_a_month_ahead_for_a_minute_ends_no_session_and_goes_on
     scene.begin("after", GOOD[2], |_| {});
     assert_eq!(scene.ends("after").phase, Phase::Completed);
     scene.until("all tasks to be done", |room| {
-        let seen = room.observer.look();
+        let seen = room.observer.lock();
         seen.tasks().len() == TASKS && seen.tasks().values().all(|task| task.phase == TaskPhase::Succeeded)
     });
     scene.comes_to_rest();

@@ -33,12 +33,12 @@ pub fn plan(
 ) -> Vec<Candidate> {
     let wanted = !view.queue.is_empty();
     let mut idle =
-        Pool::of(view, board, |r| (wanted || heard.contains(r)) && filters::robot(view, board, r, &now).is_ok());
-    let mut errands = Pool::of(view, board, |r| wanted && filters::recallable(view, board, r));
+        Pool::on_board(view, board, |r| (wanted || heard.contains(r)) && filters::robot(view, board, r, &now).is_ok());
+    let mut errands = Pool::on_board(view, board, |r| wanted && filters::recallable(view, board, r));
     let present: BTreeSet<RobotId> = idle.robots().chain(errands.robots()).cloned().collect();
     let mut walk = view.queue.walk(&present, heard);
-    idle.keep(&walk.robots);
-    errands.keep(&walk.robots);
+    idle.retain(&walk.robots);
+    errands.retain(&walk.robots);
     let mut recalled = errand_reports::stopping(view);
     while !(idle.is_empty() && errands.is_empty()) {
         if plan.is_cut() {
@@ -48,11 +48,11 @@ pub fn plan(
         let Some(task_id) = view.queue.next(&mut walk) else { break };
         let Some((task, intake)) = view.task(&task_id).zip(view.intake(&task_id)) else { continue };
         plan.report.looked += 1;
-        plan.slice.look(1);
+        plan.slice.count_looks(1);
         if filters::task(view, board, task, intake, &now).is_err() {
             continue;
         }
-        if let Some(robot_id) = idle.take(view, board, task, intake, &now, &mut plan.slice) {
+        if let Some(robot_id) = idle.take_nearest(view, board, task, intake, &now, &mut plan.slice) {
             let (task, intake) = (task.clone(), intake.clone());
             plan.decide(view, now, "fleet", |tx| offer(tx, &task, &intake, &robot_id, board));
             plan.report.offers += 1;
@@ -60,7 +60,7 @@ pub fn plan(
         }
         if recalled > 0 {
             recalled -= 1;
-        } else if let Some(robot_id) = errands.take(view, board, task, intake, &now, &mut plan.slice) {
+        } else if let Some(robot_id) = errands.take_nearest(view, board, task, intake, &now, &mut plan.slice) {
             plan.decide(view, now, "fleet", |tx| errand_reports::stop(tx, &robot_id));
         }
     }
@@ -82,7 +82,7 @@ fn offer(tx: &mut Tx, task: &TaskState, intake: &TaskIntake, robot_id: &RobotId,
     let mut granted = task.clone();
     granted.epoch += 1;
     granted.robot_id = Some(robot_id.clone());
-    tx.put(granted, "task.granted");
+    tx.put_row(granted, "task.granted");
     let mut record = attempts::fresh_attempt(tx, attempt, robot_id, anchor);
     record.step_index = task.next_step;
     if let Some(been) = &mut record.been {
@@ -90,11 +90,11 @@ fn offer(tx: &mut Tx, task: &TaskState, intake: &TaskIntake, robot_id: &RobotId,
     }
     record.opened = task.opened.is_some();
     attempts::take_robot(tx, &record);
-    tx.put(record.clone(), "attempt.offered");
+    tx.put_row(record.clone(), "attempt.offered");
     arm(tx, TimerKind::OfferAck, &record.attempt, limits::OFFER_VALID.as_ms());
-    happen(tx, &intake.task_id, News::of(Event::PlanOffers, None));
+    happen(tx, &intake.task_id, News::from_event(Event::PlanOffers, None));
     let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
     let mut control = known.unwrap_or_else(|| RobotControl::new(robot_id.clone()));
     control.tasks += 1;
-    tx.put(control, "robot.given");
+    tx.put_row(control, "robot.given");
 }

@@ -33,7 +33,7 @@ pub struct Pool {
 
 impl Pool {
     /// Robots of the board for which `can` holds.
-    pub fn of(view: &FleetProjection, board: &Board, can: impl Fn(&RobotId) -> bool) -> Self {
+    pub fn on_board(view: &FleetProjection, board: &Board, can: impl Fn(&RobotId) -> bool) -> Self {
         let known = board.iter().filter(|(id, _)| can(id));
         let all: Vec<_> = known
             .filter_map(|(id, live)| {
@@ -56,14 +56,14 @@ impl Pool {
     }
 
     /// Leaves out all but these.
-    pub fn keep(&mut self, robots: &BTreeSet<RobotId>) {
+    pub fn retain(&mut self, robots: &BTreeSet<RobotId>) {
         let all = &self.all;
         self.left.retain(|(ix, ..)| robots.contains(&all[*ix].robot_id));
     }
 
     /// Takes the nearest that passes every filter: another than one that failed the task, if there is one; then by distance, tasks so
     /// far, id. Each robot that the filters look at is a look of the slice.
-    pub fn take(
+    pub fn take_nearest(
         &mut self,
         view: &FleetProjection,
         board: &Board,
@@ -83,7 +83,7 @@ impl Pool {
             Some((failed(ix), distance, tasks, ix))
         };
         let mut passes = |nth: &usize| {
-            slice.look(1);
+            slice.count_looks(1);
             filters::pair(view, board, &self.all[self.left[*nth].0].robot_id, task, intake, now).is_ok()
         };
         // Nearly always the first one passes; only else are all put in order.

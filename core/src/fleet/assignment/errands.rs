@@ -22,7 +22,7 @@ use std::collections::BTreeMap;
 /// Sends robots that are still idle to charge or park.
 pub fn plan(view: &mut FleetProjection, board: &Board, now: Now, idle: Vec<Candidate>, plan: &mut Plan) {
     let waiting = !view.queue.is_empty();
-    let mut coming = Coming::of(view);
+    let mut coming = Coming::from_projection(view);
     for Candidate { robot_id, at: here, .. } in idle {
         if plan.is_cut() {
             return;
@@ -47,7 +47,7 @@ pub fn plan(view: &mut FleetProjection, board: &Board, now: Now, idle: Vec<Candi
 struct Coming(BTreeMap<WaypointId, usize>);
 
 impl Coming {
-    fn of(view: &FleetProjection) -> Self {
+    fn from_projection(view: &FleetProjection) -> Self {
         let mut coming = Self(BTreeMap::new());
         for a in view.attempts.values().map(|a| &a.row).filter(|a| !a.phase.is_terminal()) {
             if let Some(goal) = &a.goal {
@@ -92,7 +92,7 @@ fn wish(
 /// Where a robot that stands at `here` would park; none if it parks already or everything is taken.
 pub(in crate::fleet) fn park_for(view: &FleetProjection, robot_id: &RobotId, here: WaypointIx) -> Option<WaypointIx> {
     let parks = view.site.waypoint(here).kind == Kind::Park || !view.site.collisions_modelled();
-    if parks { None } else { park_goal(view, &Coming::of(view), robot_id, here) }
+    if parks { None } else { park_goal(view, &Coming::from_projection(view), robot_id, here) }
 }
 
 fn park_goal(view: &FleetProjection, coming: &Coming, robot_id: &RobotId, here: WaypointIx) -> Option<WaypointIx> {
@@ -132,11 +132,11 @@ pub(in crate::fleet) fn begin(tx: &mut Tx, robot_id: &RobotId, errand: Errand, g
     let mut control = known.unwrap_or_else(|| RobotControl::new(robot_id.clone()));
     control.errands += 1;
     let subject = Subject::Errand { robot_id: robot_id.clone(), number: control.errands };
-    tx.put(control, "robot.given");
+    tx.put_row(control, "robot.given");
     let mut a = attempts::fresh_attempt(tx, AttemptId { subject, epoch: 1 }, robot_id, anchor);
     a.errand = Some(errand);
     a.goal = Some(tx.view.site.name_of(goal).clone());
     attempts::take_robot(tx, &a);
     arm(tx, TimerKind::OfferAck, &a.attempt, limits::OFFER_VALID.as_ms());
-    tx.put(a, "errand.offered");
+    tx.put_row(a, "errand.offered");
 }

@@ -217,7 +217,7 @@ pub fn task(
     {
         return Err(Reason::from(Code::RobotReconciling).with("robot_id", robot_id));
     }
-    Wait::of(task, intake, &view.ended, now.utc).reason().map_or(Ok(()), Err)
+    Wait::of_task(task, intake, &view.ended, now.utc).reason().map_or(Ok(()), Err)
 }
 
 /// An idle-looking errand that may be broken off for a task: parking, or charging above the area's threshold.

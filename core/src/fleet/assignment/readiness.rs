@@ -34,7 +34,7 @@ pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut 
         plan.decide(view, now, "fleet", |tx| {
             if is_unmarked && let Some(mut task) = tx.view.task(&task_id).cloned() {
                 task.ready_since = Some(now.utc);
-                tx.put(task, "task.ready");
+                tx.put_row(task, "task.ready");
             }
             timers::count_readiness(tx, &task_id);
         });
@@ -46,7 +46,7 @@ pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut 
 /// Gives a waiting task to a person.
 fn ask_person(view: &mut FleetProjection, now: Now, task_id: &TaskId, why: Option<&Reason>, plan: &mut Plan) {
     plan.decide(view, now, "fleet", |tx| {
-        happen(tx, task_id, News::of(Event::ScheduleToStart, why));
+        happen(tx, task_id, News::from_event(Event::ScheduleToStart, why));
     });
 }
 

@@ -49,7 +49,7 @@ pub(in crate::fleet) fn open_as(
         opened: tx.now.utc,
         closed: None,
     };
-    tx.put(incident, "incident.opened");
+    tx.put_row(incident, "incident.opened");
 }
 
 /// Opens an incident unless an open one says the same of the robot: what goes on is met again and again.
@@ -91,7 +91,7 @@ pub fn tell_of_place(tx: &mut Tx, reason: Reason, place_id: &PlaceId) {
     match known {
         None => open(tx, reason, None, None),
         Some(known) if known.reason == reason => {}
-        Some(known) => tx.put(Incident { reason, robot_id: None, ..known }, "incident.changed"),
+        Some(known) => tx.put_row(Incident { reason, robot_id: None, ..known }, "incident.changed"),
     }
 }
 
@@ -106,7 +106,7 @@ pub fn close_about(tx: &mut Tx, code: Code, robot_id: &RobotId, reason: &str) {
 pub fn close(tx: &mut Tx, incident_id: &str, reason: &str, actor: &str) {
     let Some(mut incident) = tx.view.incidents.get(incident_id).map(|i| i.row.clone()) else { return };
     incident.closed = Some(Closed { actor: actor.to_owned(), reason: reason.to_owned(), at: tx.now.utc });
-    tx.put(incident, "incident.closed");
+    tx.put_row(incident, "incident.closed");
 }
 
 /// Tells people of every decision, and of every row of a newer version, that was put aside since.

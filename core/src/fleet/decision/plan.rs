@@ -27,7 +27,7 @@ pub struct Plan {
 
 impl Plan {
     /// An empty plan of a turn that may do so much.
-    pub fn of(slice: Slice) -> Self {
+    pub fn for_slice(slice: Slice) -> Self {
         Self { slice, ..Self::default() }
     }
     /// Makes one decision; nothing is added if it changed nothing. False: it was given up, since the store would never take it.
@@ -74,5 +74,5 @@ impl Plan {
 }
 
 pub(in crate::fleet) fn mark(tx: &mut Tx, seq: Seq) {
-    tx.put(FleetMark { seq }, "fleet.consumed");
+    tx.put_row(FleetMark { seq }, "fleet.consumed");
 }

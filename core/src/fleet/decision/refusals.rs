@@ -66,10 +66,10 @@ mod tests {
 
     /// More rows than an item takes.
     fn too_much(tx: &mut Tx) {
-        tx.put(RobotAuthority { robot_id: robot(), holder: RobotHolder::None }, "robot.known");
+        tx.put_row(RobotAuthority { robot_id: robot(), holder: RobotHolder::None }, "robot.known");
         for n in 0..limits::ITEM_ROWS_MAX {
             let token = format!("stop:{n}");
-            tx.put(HoldToken { robot_id: robot(), token, since: tx.now.utc }, "hold.stopped");
+            tx.put_row(HoldToken { robot_id: robot(), token, since: tx.now.utc }, "hold.stopped");
         }
     }
 

@@ -17,21 +17,21 @@ pub struct Slice {
 
 impl Default for Slice {
     fn default() -> Self {
-        Self::of(limits::DECISIONS_PER_STAGE)
+        Self::for_decisions(limits::DECISIONS_PER_STAGE)
     }
 }
 
 impl Slice {
     /// So many decisions a stage, and as many looks as take the same time.
-    pub const fn of(decisions: usize) -> Self {
+    pub const fn for_decisions(decisions: usize) -> Self {
         Self { looks: decisions * limits::LOOKS_PER_DECISION, decisions, whole: decisions }
     }
     /// The next stage begins.
     pub const fn renew(&mut self) {
-        *self = Self::of(self.whole);
+        *self = Self::for_decisions(self.whole);
     }
     /// Looks were taken.
-    pub(in crate::fleet) const fn look(&mut self, looks: usize) {
+    pub(in crate::fleet) const fn count_looks(&mut self, looks: usize) {
         self.looks = self.looks.saturating_sub(looks);
     }
     /// Decisions were made.

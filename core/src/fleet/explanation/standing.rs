@@ -66,7 +66,7 @@ pub fn of_task(
 
 fn queued(view: &FleetProjection, board: &Board, now: &Now, task: &TaskState, intake: &TaskIntake) -> Option<Reason> {
     let why = filters::task(view, board, task, intake, now).err()?;
-    let what = match Wait::of(task, intake, &view.ended, now.utc) {
+    let what = match Wait::of_task(task, intake, &view.ended, now.utc) {
         Wait::Time(at) => at.rfc3339(),
         Wait::Hold(token) => return Some(held(why.code, &token)),
         Wait::Dependency(id) | Wait::Failed(id) => format!("task {id}"),

@@ -31,7 +31,7 @@ pub(in crate::fleet) fn count_unexplained(view: &mut FleetProjection, board: &Bo
         let task = TaskId::parse(id).ok().and_then(|id| view.task(&id));
         found.push((format!("task {id}"), task.is_none_or(|task| is_explained(view, board, &now, task, &idle))));
     }
-    plan.slice.look(robots.len() + tasks.len() * (1 + idle.len()));
+    plan.slice.count_looks(robots.len() + tasks.len() * (1 + idle.len()));
     (view.unexplained.robot, view.unexplained.task) =
         (robots.into_iter().next_back().unwrap_or_default(), tasks.into_iter().next_back().unwrap_or_default());
     let is_known = |view: &FleetProjection, key: &str| match key.split_once(' ') {

@@ -55,7 +55,7 @@ pub fn refused(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
 fn break_off(tx: &mut Tx, robot_id: &RobotId, reason: Reason) {
     let since = Some(tx.now.utc);
     let broken = RobotControl { unanswered_since: since, unanswered: Vec::new(), ..control(tx, robot_id) };
-    tx.put(broken, "robot.broken_off");
+    tx.put_row(broken, "robot.broken_off");
     incidents::open_about(tx, reason, Some(robot_id), "");
 }
 
@@ -81,7 +81,7 @@ fn count(tx: &mut Tx, robot_id: &RobotId) {
     control.unanswered.retain(|at| now.ms_since(*at) <= limits::BREAKER_WINDOW.as_ms());
     control.unanswered.push(now);
     let is_broken = control.unanswered_since.is_some() || control.unanswered.len() >= limits::BREAKER_FAILURES;
-    tx.put(control, "robot.missed_offer");
+    tx.put_row(control, "robot.missed_offer");
     if is_broken {
         break_off(tx, robot_id, Code::RobotDoesNotAnswer.into());
     }
@@ -96,7 +96,7 @@ fn excuse(tx: &mut Tx, robot_id: &RobotId) {
     control.unanswered_since =
         control.unanswered_since.filter(|at| now.ms_since(*at) > limits::UNANSWERED_AT_ONCE.as_ms());
     if before != (control.unanswered.len(), control.unanswered_since) {
-        tx.put(control, "robot.excused");
+        tx.put_row(control, "robot.excused");
     }
 }
 
@@ -106,7 +106,7 @@ pub fn answered(tx: &mut Tx, robot_id: &RobotId) {
     tx.view.answers.backed_off.remove(robot_id);
     let control = control(tx, robot_id);
     if control.unanswered_since.is_some() {
-        tx.put(RobotControl { unanswered_since: None, unanswered: Vec::new(), ..control }, "robot.answered");
+        tx.put_row(RobotControl { unanswered_since: None, unanswered: Vec::new(), ..control }, "robot.answered");
         incidents::close_about(tx, Code::RobotDoesNotAnswer, robot_id, "it answered an offer");
     }
 }

@@ -76,7 +76,7 @@ pub fn doubt(tx: &mut Tx, robot_id: &RobotId, id: &AttemptId, why: &Reason) {
     }
     match id.subject.task_id() {
         Some(task_id) => {
-            happen(tx, task_id, News::of(Event::LeaseOver, Some(why)));
+            happen(tx, task_id, News::from_event(Event::LeaseOver, Some(why)));
         }
         None => errand_reports::lease_over(tx, robot_id, why.clone()),
     }

@@ -27,19 +27,19 @@ pub fn hardware_stop(tx: &mut Tx, robot_id: &RobotId, stop: HardwareStop) {
     let since = tx.now.utc;
     if stop != HardwareStop::None && !stands {
         tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &resume), "hold.replaced");
-        tx.put(HoldToken { robot_id: robot_id.clone(), token: stopped, since }, "hold.stopped");
+        tx.put_row(HoldToken { robot_id: robot_id.clone(), token: stopped, since }, "hold.stopped");
         touch(tx, robot_id);
         holds_changed(tx, robot_id);
     } else if stop == HardwareStop::None && stands {
         tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &stopped), "hold.released");
-        tx.put(HoldToken { robot_id: robot_id.clone(), token: resume, since }, "hold.awaits_resume");
+        tx.put_row(HoldToken { robot_id: robot_id.clone(), token: resume, since }, "hold.awaits_resume");
     }
 }
 
 /// Every offer writes the robot's control row: one that was planned without the token that has just come is lost.
 pub(in crate::fleet) fn touch(tx: &mut Tx, robot_id: &RobotId) {
     let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
-    tx.put(known.unwrap_or_else(|| RobotControl::new(robot_id.clone())), "robot.held");
+    tx.put_row(known.unwrap_or_else(|| RobotControl::new(robot_id.clone())), "robot.held");
 }
 
 /// Tells the robot's task that a token came or that the last one went.
@@ -52,5 +52,5 @@ pub fn holds_changed(tx: &mut Tx, robot_id: &RobotId) {
     let why: Reason = if fleet_stop { Code::HoldByStop } else { Code::HoldByBody }.into();
     let event = if transitions::is_held(tx, &task) { Event::Hold } else { Event::LastHoldGone };
     let why = (event == Event::Hold).then_some(&why);
-    happen(tx, &task_id, News::of(event, why));
+    happen(tx, &task_id, News::from_event(event, why));
 }

@@ -111,10 +111,10 @@ pub fn carries(tx: &mut Tx, robot_id: &RobotId, load: &Load) {
     let attempt = task.and_then(|t| t.attempt_id()).filter(|id| tx.view.held_by(robot_id) == Some(id));
     let Some((mut task, id)) = task.cloned().zip(attempt) else { return };
     task.opened = Some(robot_id.clone());
-    tx.put(task, "task.opened");
+    tx.put_row(task, "task.opened");
     if let Some(mut a) = tx.view.attempt(&id).cloned() {
         a.opened = true;
-        tx.put(a, "attempt.changed");
+        tx.put_row(a, "attempt.changed");
     }
 }
 
@@ -154,7 +154,7 @@ pub fn place(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64,
             if news == PlaceNews::Left { "place.left" } else { "place.not_entered" }
         }
     };
-    tx.put(place, kind);
+    tx.put_row(place, kind);
     if news == PlaceNews::Entered {
         claims::entered(tx, robot_id, place_id);
     }
@@ -169,7 +169,7 @@ fn mode_changed(tx: &mut Tx, robot_id: &RobotId, mode: Mode) {
     let why = Reason::from(Code::ManualMode).with("robot_id", robot_id);
     match tx.view.held_by(robot_id).map(|a| a.subject.task_id().cloned()) {
         Some(Some(task_id)) => {
-            happen(tx, &task_id, News::of(Event::LeaseOver, Some(&why)));
+            happen(tx, &task_id, News::from_event(Event::LeaseOver, Some(&why)));
         }
         Some(None) => errand_reports::lease_over(tx, robot_id, why),
         None => {}

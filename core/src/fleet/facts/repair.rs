@@ -106,7 +106,7 @@ fn recharge(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
             .with("robot_id", robot_id)
             .with("battery_permille", vitals.battery_permille)
             .with("mandatory_permille", least);
-        happen(tx, &task_id, News::of(Event::Suspend, Some(&why)));
+        happen(tx, &task_id, News::from_event(Event::Suspend, Some(&why)));
     }
 }
 
@@ -140,7 +140,7 @@ fn lease_over(tx: &mut Tx, robot_id: &RobotId, tally: &mut Tally) {
     let why = Reason::from(Code::LeaseOver).with("robot_id", robot_id);
     match id.subject.task_id() {
         Some(task_id) => {
-            happen(tx, task_id, News::of(Event::LeaseOver, Some(&why)));
+            happen(tx, task_id, News::from_event(Event::LeaseOver, Some(&why)));
         }
         None => errand_reports::lease_over(tx, robot_id, why),
     }
@@ -244,7 +244,7 @@ fn forget_disowned(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     }
     let mut control = control.clone();
     control.disowned.retain(is_listed);
-    tx.put(control, "robot.disowned");
+    tx.put_row(control, "robot.disowned");
 }
 
 /// A robot in automatic mode lists an attempt that the record has as unanswered or UNCERTAIN.
@@ -283,7 +283,7 @@ fn stalled(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     let quiet = tx.now.site.since(live.progress_at.max(tx.view.started.site).max(excused_at)).as_ms();
     if quiet > stall_ms && !young {
         let why = Reason::from(Code::Stalled).with("quiet_ms", quiet);
-        happen(tx, &task_id, News::of(Event::Stall, Some(&why)));
+        happen(tx, &task_id, News::from_event(Event::Stall, Some(&why)));
     }
 }
 

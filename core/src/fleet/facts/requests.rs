@@ -55,11 +55,11 @@ pub fn obey_request(
 fn cancel(tx: &mut Tx, task_id: &TaskId, force: bool, request: &TaskRequest) {
     let Some(mut task) = tx.view.task(task_id).cloned() else { return };
     task.cancel_requested = Some(tx.now.utc);
-    tx.put(task, "task.cancel_requested");
+    tx.put_row(task, "task.cancel_requested");
     let code = if force { Code::Forced } else { Code::CanceledByUser };
     let why = Reason::new(code, request.reason.clone()).with("actor", &request.actor);
     let event = if force { Event::CancelForce } else { Event::Cancel };
-    happen(tx, task_id, News::of(event, Some(&why)));
+    happen(tx, task_id, News::from_event(event, Some(&why)));
 }
 
 /// What a person may answer to a task in NEEDS_OPERATOR.
@@ -92,7 +92,7 @@ fn resolve(tx: &mut Tx, task_id: &TaskId, resolution: Resolution, request: &Task
         }
         _ => {}
     }
-    tx.put(task, "task.resolved");
+    tx.put_row(task, "task.resolved");
     let event = match resolution {
         Resolution::Requeue | Resolution::RequeueHandedOver | Resolution::RequeuePutBack => Event::ResolveRequeue,
         Resolution::Succeeded => Event::ResolveSucceeded,
@@ -100,7 +100,7 @@ fn resolve(tx: &mut Tx, task_id: &TaskId, resolution: Resolution, request: &Task
         Resolution::Canceled => Event::ResolveCanceled,
     };
     let why = Reason::new(Code::ResolvedByUser, request.reason.clone()).with("actor", &request.actor);
-    happen(tx, task_id, News::of(event, Some(&why)));
+    happen(tx, task_id, News::from_event(event, Some(&why)));
 }
 
 /// One thing that is let go.
@@ -151,9 +151,9 @@ fn resume(tx: &mut Tx, resume: &Resume) {
             let Some(mut task) = tx.view.task(task_id).cloned() else { return };
             task.holds.retain(|h| !tokens.contains(h));
             let free = task.holds.is_empty();
-            tx.put(task, "task.resumed");
+            tx.put_row(task, "task.resumed");
             if free {
-                happen(tx, task_id, News::of(Event::LastHoldGone, None));
+                happen(tx, task_id, News::from_event(Event::LastHoldGone, None));
             }
         }
     }

@@ -65,7 +65,7 @@ pub fn plan(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan
         let live = board.get(&robot_id).filter(|_| online).cloned();
         for _ in 0..=limits::HOLDS_OF_ROBOT_MAX.div_ceil(limits::HOLDS_PER_ITEM) {
             let mut is_done = true;
-            plan.decide(view, now, "stop", |tx| is_done = look(tx, &robot_id, live.as_deref()));
+            plan.decide(view, now, "stop", |tx| is_done = correct_tokens(tx, &robot_id, live.as_deref()));
             if is_done {
                 break;
             }
@@ -90,7 +90,7 @@ fn open_incidents(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
 }
 
 /// Puts one robot's tokens right, as many as one item takes; `live` only while it is heard. False: there are more.
-fn look(tx: &mut Tx, robot_id: &RobotId, live: Option<&Live>) -> bool {
+fn correct_tokens(tx: &mut Tx, robot_id: &RobotId, live: Option<&Live>) -> bool {
     let (waits, engaged): (BTreeSet<StopId>, BTreeSet<StopId>) = match live.map(|live| &live.report) {
         Some(r) => (r.awaiting_resume.iter().cloned().collect(), r.stops.iter().cloned().collect()),
         None => Default::default(),
@@ -131,7 +131,7 @@ fn look(tx: &mut Tx, robot_id: &RobotId, live: Option<&Live>) -> bool {
     let keeps = |id: &StopId| !wanted.contains_key(id) && (live.is_none() || waits.contains(id));
     let resumed: Vec<StopId> = control.resumed.iter().filter(|id| keeps(id)).cloned().collect();
     if resumed != control.resumed {
-        tx.put(RobotControl { resumed, ..control }, "robot.resumed");
+        tx.put_row(RobotControl { resumed, ..control }, "robot.resumed");
         tx.view.dirty.insert(robot_id.clone());
     }
     wanted == tokens || write(tx, robot_id, &tokens, &wanted)
@@ -147,7 +147,7 @@ fn write(tx: &mut Tx, robot_id: &RobotId, tokens: &BTreeMap<StopId, Hold>, wante
             tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &old.token(stop_id)), "hold.replaced");
         }
         let fact = if *hold == Hold::Stop { "hold.stopped" } else { "hold.awaits_resume" };
-        tx.put(HoldToken { robot_id: robot_id.clone(), token: hold.token(stop_id), since }, fact);
+        tx.put_row(HoldToken { robot_id: robot_id.clone(), token: hold.token(stop_id), since }, fact);
     }
     touch(tx, robot_id);
     holds_changed(tx, robot_id);
@@ -164,6 +164,6 @@ pub(in crate::fleet) fn resumed(tx: &mut Tx, robot_id: &RobotId, token: &str) {
         // The oldest was for a robot that has not been heard for long: it is resumed once more.
         let surplus = control.resumed.len().saturating_sub(limits::STOPS_MAX);
         control.resumed.drain(..surplus);
-        tx.put(control, "robot.resumed");
+        tx.put_row(control, "robot.resumed");
     }
 }

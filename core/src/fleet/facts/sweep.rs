@@ -39,7 +39,7 @@ pub(in crate::fleet) fn carry_out(
     let mut compared = BTreeSet::new();
     while let Some(robot_id) = view.agenda.heard.first().filter(|_| !plan.is_cut()).cloned() {
         view.agenda.heard.remove(&robot_id);
-        plan.slice.look(1);
+        plan.slice.count_looks(1);
         repair::robot(view, now, &robot_id, board, plan);
         compared.insert(robot_id);
     }
@@ -56,7 +56,7 @@ pub(in crate::fleet) fn carry_out(
     }
     while let Some(task_id) = view.agenda.suspended.pop_if(|_| !plan.is_cut()) {
         plan.decide(view, now, "fleet", |tx| {
-            happen(tx, &task_id, News::of(Event::RetryDue, None));
+            happen(tx, &task_id, News::from_event(Event::RetryDue, None));
         });
     }
     compared

@@ -48,7 +48,7 @@ impl Area {
     }
 
     /// One more is out of work.
-    fn take(&mut self, view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotId) {
+    fn take_out(&mut self, view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotId) {
         self.draining.insert(robot_id.clone());
         if self.off_work.insert(robot_id.clone()) && self.robots.contains(robot_id) {
             for (capability, count) in &mut self.able {
@@ -97,7 +97,7 @@ pub fn plan(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan
         if why.is_none()
             && let Some(area) = here.as_ref().and_then(|area| areas.get_mut(area))
         {
-            area.take(view, board, &now, &drain.robot_id);
+            area.take_out(view, board, &now, &drain.robot_id);
         }
         plan.decide(view, now, "fleet", |tx| match why {
             Some(why) if drain.why.as_ref().is_some_and(|known| is_same(known, &why)) => {}
@@ -114,7 +114,7 @@ fn wait(tx: &mut Tx, drain: Drain, why: Reason, area_id: Option<AreaId>, areas: 
     {
         put_row(tx, id, area);
     }
-    tx.put(Drain { why: Some(why), ..drain }, "drain.waits");
+    tx.put_row(Drain { why: Some(why), ..drain }, "drain.waits");
 }
 
 fn begin(tx: &mut Tx, drain: Drain, area_id: Option<AreaId>, areas: &BTreeMap<AreaId, Area>) {
@@ -123,7 +123,7 @@ fn begin(tx: &mut Tx, drain: Drain, area_id: Option<AreaId>, areas: &BTreeMap<Ar
     }
     let (state, since, drain_id) = (DrainState::Draining, tx.now.utc, drain.drain_id.clone());
     let rules = area_id.clone();
-    tx.put(Drain { state, since, area_id, why: None, ..drain }, "drain.begun");
+    tx.put_row(Drain { state, since, area_id, why: None, ..drain }, "drain.begun");
     tx.rely::<DrainRequest>(drain_id.as_str());
     tx.rely::<DrainRelease>(drain_id.as_str());
     if let Some(area_id) = rules {
@@ -133,7 +133,7 @@ fn begin(tx: &mut Tx, drain: Drain, area_id: Option<AreaId>, areas: &BTreeMap<Ar
 
 fn put_row(tx: &mut Tx, area_id: &AreaId, area: &Area) {
     let row = row_of(tx.view, area_id, area);
-    tx.put(row, "area.off_work");
+    tx.put_row(row, "area.off_work");
 }
 
 fn row_of(view: &FleetProjection, area_id: &AreaId, area: &Area) -> AreaBudget {

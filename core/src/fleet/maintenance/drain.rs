@@ -49,7 +49,7 @@ pub fn ask(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str, within_ms
         urgent: true,
         returns: false,
     };
-    tx.put(drain, "drain.asked");
+    tx.put_row(drain, "drain.asked");
 }
 
 /// Ends every drain of the robot that a person asked for, and gives the robot back to work.
@@ -63,7 +63,7 @@ pub fn release(tx: &mut Tx, robot_id: &RobotId) {
 fn give_back(tx: &mut Tx, robot_id: &RobotId, drain_id: &DrainId) {
     let held = tx.view.authority.get(robot_id.as_str()).map(|a| a.row.holder.clone());
     if held == Some(RobotHolder::Maintenance(drain_id.clone())) {
-        tx.put(RobotAuthority { robot_id: robot_id.clone(), holder: RobotHolder::None }, "robot.freed");
+        tx.put_row(RobotAuthority { robot_id: robot_id.clone(), holder: RobotHolder::None }, "robot.freed");
     }
     tx.delete::<Drain>(drain_id.as_str(), "drain.released");
 }
@@ -108,7 +108,7 @@ pub fn obey(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
                 urgent: request.urgent,
                 returns: request.returns,
             };
-            tx.put(drain, "drain.asked");
+            tx.put_row(drain, "drain.asked");
         });
     }
 }
@@ -142,7 +142,7 @@ fn further(tx: &mut Tx, drain: &Drain, board: &Board) {
                 park(tx, drain, &live, board);
             }
         }
-        RobotHolder::None if is_at_rest(tx.view, drain, live.as_deref()) => take(tx, drain),
+        RobotHolder::None if is_at_rest(tx.view, drain, live.as_deref()) => take_out(tx, drain),
         _ if left_ms == 0 => refuse(tx, drain),
         RobotHolder::None => {
             if let Some(live) = live {
@@ -156,7 +156,7 @@ fn further(tx: &mut Tx, drain: &Drain, board: &Board) {
                 });
                 if suspends {
                     let why = Reason::from(Code::DrainSuspend).with("drain_id", &drain.drain_id);
-                    transitions::happen(tx, task_id, News::of(Event::Suspend, Some(&why)));
+                    transitions::happen(tx, task_id, News::from_event(Event::Suspend, Some(&why)));
                 }
             }
             // A charge ends as it is: the robot keeps its place and goes on charging. A way to a charger or to a park goes on.
@@ -214,13 +214,13 @@ fn park(tx: &mut Tx, drain: &Drain, live: &Live, board: &Board) {
     }
 }
 
-fn take(tx: &mut Tx, drain: &Drain) {
+fn take_out(tx: &mut Tx, drain: &Drain) {
     let holder = RobotHolder::Maintenance(drain.drain_id.clone());
-    tx.put(RobotAuthority { robot_id: drain.robot_id.clone(), holder }, "robot.drained");
-    tx.put(Drain { state: DrainState::Held, ..drain.clone() }, "drain.held");
+    tx.put_row(RobotAuthority { robot_id: drain.robot_id.clone(), holder }, "robot.drained");
+    tx.put_row(Drain { state: DrainState::Held, ..drain.clone() }, "drain.held");
 }
 
 fn refuse(tx: &mut Tx, drain: &Drain) {
     let why = Some(Reason::from(Code::SkippedBusy).with("within_ms", drain.within_ms));
-    tx.put(Drain { state: DrainState::Refused, why, ..drain.clone() }, "drain.refused");
+    tx.put_row(Drain { state: DrainState::Refused, why, ..drain.clone() }, "drain.refused");
 }

@@ -160,13 +160,13 @@ impl Indexed<Place> for FleetProjection {
 pub(in crate::fleet) fn put_in_queue(view: &mut FleetProjection, task_id: &TaskId) {
     let rows = view.task(task_id).filter(|task| task.phase == Phase::Queued).zip(view.intake(task_id));
     let wait = rows.map(|(task, intake)| {
-        let wait = match Wait::of(task, intake, &view.ended, view.queue.now) {
+        let wait = match Wait::of_task(task, intake, &view.ended, view.queue.now) {
             Wait::Turn(rank) if view.bugs.nobody_is_promoted() => Wait::Turn(rank.unpromoted(intake.spec.priority)),
             wait => wait,
         };
         (wait, task.queued_since)
     });
-    view.queue.put(task_id, wait);
+    view.queue.set_wait(task_id, wait);
 }
 
 /// A task has ended: those that depend on it, if there are any, wait for the next thing, or for nothing more.

@@ -80,7 +80,7 @@ impl FleetProjection {
     ///
     /// # Errors
     /// A row that cannot be read.
-    pub fn tell(&mut self, keys: &[Key], rows: &[Row]) -> Result<(), BadRow> {
+    pub fn apply_rows(&mut self, keys: &[Key], rows: &[Row]) -> Result<(), BadRow> {
         for key in keys.iter().filter(|key| key.table == Table::TaskState) {
             if let Ok(id) = TaskId::parse(&key.id) {
                 self.unasked.remove(&id);

@@ -36,9 +36,9 @@ pub struct Rank {
 }
 
 impl Rank {
-    fn of(task: &TaskState, intake: &TaskIntake, since: Utc, now: Utc) -> Self {
-        let class = Class::of(intake.spec.priority, promotions(since, now));
-        let promoted = class != Class::of(intake.spec.priority, 0);
+    fn of_task(task: &TaskState, intake: &TaskIntake, since: Utc, now: Utc) -> Self {
+        let class = Class::from_priority(intake.spec.priority, promotions(since, now));
+        let promoted = class != Class::from_priority(intake.spec.priority, 0);
         let priority = if promoted { 0 } else { intake.spec.priority };
         Self { class, promoted, priority, since, number: task.number, task_id: task.task_id.clone() }
     }
@@ -47,7 +47,7 @@ impl Rank {
 impl Rank {
     /// As if it had not waited.
     pub(in crate::fleet) fn unpromoted(self, priority: u8) -> Self {
-        Self { class: Class::of(priority, 0), promoted: false, priority, ..self }
+        Self { class: Class::from_priority(priority, 0), promoted: false, priority, ..self }
     }
 }
 
@@ -75,7 +75,7 @@ pub enum Wait {
 
 impl Wait {
     /// What a task waits for, whatever its phase.
-    pub fn of(task: &TaskState, intake: &TaskIntake, ended: &BTreeMap<TaskId, Phase>, now: Utc) -> Self {
+    pub fn of_task(task: &TaskState, intake: &TaskIntake, ended: &BTreeMap<TaskId, Phase>, now: Utc) -> Self {
         if let Some(at) = intake.spec.not_before.filter(|at| *at > now) {
             return Self::Time(at);
         }
@@ -89,7 +89,7 @@ impl Wait {
                 None => return Self::Dependency(id.clone()),
             }
         }
-        task.ready_since.map_or(Self::Mark, |since| Self::Turn(Rank::of(task, intake, since, now)))
+        task.ready_since.map_or(Self::Mark, |since| Self::Turn(Rank::of_task(task, intake, since, now)))
     }
     /// What it waits for, in one word.
     fn code(&self) -> Code {
@@ -120,7 +120,7 @@ pub(in crate::fleet) struct Waiting {
 }
 
 impl Waiting {
-    fn of(wait: Wait, queued_since: Utc, now: Utc) -> Self {
+    fn from_wait(wait: Wait, queued_since: Utc, now: Utc) -> Self {
         let after = |since: Utc| since.plus_ms(limits::MAX_WAIT.as_ms() * (promotions(since, now) + 1));
         let age = match &wait {
             Wait::Turn(rank) => Some(rank.since.max(queued_since)),
@@ -261,9 +261,9 @@ impl Queue {
         walk.after.as_ref().map(|rank| rank.task_id.clone())
     }
 
-    pub(in crate::fleet) fn put(&mut self, task_id: &TaskId, wait: Option<(Wait, Utc)>) {
+    pub(in crate::fleet) fn set_wait(&mut self, task_id: &TaskId, wait: Option<(Wait, Utc)>) {
         let now = self.now;
-        let new = wait.map(|(wait, queued_since)| Waiting::of(wait, queued_since, now));
+        let new = wait.map(|(wait, queued_since)| Waiting::from_wait(wait, queued_since, now));
         if self.waiting.get(task_id) == new.as_ref() {
             return;
         }
@@ -337,7 +337,7 @@ mod tests {
 
     fn rank(n: u64) -> Rank {
         let task_id = TaskId::parse(&format!("T{n:04}")).expect("an id");
-        Rank { class: Class::of(5, 0), promoted: false, priority: 5, since: Utc(0), number: n, task_id }
+        Rank { class: Class::from_priority(5, 0), promoted: false, priority: 5, since: Utc(0), number: n, task_id }
     }
 
     #[test]
@@ -345,7 +345,7 @@ mod tests {
         for many in [0, 1, 63, 64, 65, 1_000] {
             let mut queue = Queue::new(Utc(0));
             for n in 0..many {
-                queue.put(&rank(n).task_id, Some((Wait::Turn(rank(n)), Utc(0))));
+                queue.set_wait(&rank(n).task_id, Some((Wait::Turn(rank(n)), Utc(0))));
             }
             let prepared = queue.milestones().as_ptr();
             for n in 0..many {
@@ -355,7 +355,7 @@ mod tests {
             assert!(queue.milestones().len() == many as usize / MILESTONE);
             assert_eq!(queue.position(&rank(many).task_id), None);
             if many > 1 {
-                queue.put(&rank(0).task_id, None);
+                queue.set_wait(&rank(0).task_id, None);
                 assert_eq!(queue.position(&rank(many - 1).task_id), Some(many as usize - 1));
             }
         }

@@ -67,7 +67,7 @@ fn note_until(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, last: u32) {
     if let Some(been) = &mut a.been {
         been.places.insert(place_id.clone());
     }
-    tx.put(a, "attempt.changed");
+    tx.put_row(a, "attempt.changed");
 }
 
 /// Something that the robot said is lost: of its attempt nobody can tell any more where it was until now.
@@ -75,14 +75,14 @@ pub fn lost(tx: &mut Tx, robot_id: &RobotId) {
     let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
     if let Some(been) = a.been.as_mut().filter(|been| !been.is_broken) {
         been.is_broken = true;
-        tx.put(a, "attempt.changed");
+        tx.put_row(a, "attempt.changed");
     }
 }
 
 fn lose(tx: &mut Tx, id: &AttemptId) {
     if let Some(a) = tx.view.attempt(id).filter(|a| a.been.is_some()) {
         let unknown = Attempt { been: None, ..a.clone() };
-        tx.put(unknown, "attempt.changed");
+        tx.put_row(unknown, "attempt.changed");
     }
 }
 
@@ -170,5 +170,5 @@ pub fn wait(tx: &mut Tx, report: &AttemptReport) {
     a.opened |= report.opened;
     a.stats = report.stats;
     a.fault = report.fault.clone().or(a.fault);
-    tx.put(a, "attempt.changed");
+    tx.put_row(a, "attempt.changed");
 }

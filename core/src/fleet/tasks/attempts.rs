@@ -75,7 +75,7 @@ pub(in crate::fleet) fn note_step(a: &mut Attempt, step_index: u32) {
 
 /// Takes the robot's mutex for an attempt: the update of one row that two planners cannot both make.
 pub fn take_robot(tx: &mut Tx, a: &Attempt) {
-    tx.put(
+    tx.put_row(
         RobotAuthority { robot_id: a.robot_id.clone(), holder: RobotHolder::Attempt(a.attempt.clone()) },
         "robot.taken",
     );

@@ -31,7 +31,7 @@ pub(in crate::fleet) fn trip(tx: &mut Tx, robot_id: &RobotId) {
         let reason = Reason::from(Code::RobotBreakerOpened).with("failures", control.failures.len());
         incidents::open(tx, reason, Some(robot_id), None);
     }
-    tx.put(control, "robot.failed");
+    tx.put_row(control, "robot.failed");
 }
 
 /// Counts an attempt that the robot is about to let go, if that is its own will. The task still stands as it did before

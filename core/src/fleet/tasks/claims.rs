@@ -136,7 +136,7 @@ pub fn take_over(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: 
     }
     let (robot_id, since) = (robot_id.clone(), tx.now.utc);
     place.holders.push(PlaceHolder { robot_id, grant_id, state: HolderState::Inside, since, claimed: true });
-    tx.put(place, "place.adopted");
+    tx.put_row(place, "place.adopted");
 }
 
 /// The robot says that it has applied a newer generation than this store gave: a restore, or an error of the robot. Of the store itself its

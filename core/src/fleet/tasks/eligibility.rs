@@ -121,7 +121,7 @@ pub(in crate::fleet) fn could_ever(
     let retired = |id: &str| view.control.get(id).is_some_and(|control| control.row.duty() == Duty::Retired);
     let mut against: BTreeMap<Code, u64> = BTreeMap::new();
     for session in view.sessions.iter().filter(|(id, _)| !retired(id)).map(|(_, session)| &session.row) {
-        slice.look(1);
+        slice.count_looks(1);
         match fits(view, session, task, intake) {
             Ok(()) => return Ok(()),
             Err(reason) => *against.entry(reason.code).or_default() += 1,
@@ -129,7 +129,7 @@ pub(in crate::fleet) fn could_ever(
     }
     let unheard = view.enrolled.iter().filter(|(id, _)| !view.sessions.contains_key(*id) && !retired(id));
     for robot in unheard.map(|(_, robot)| &robot.row).filter(|robot| robot.revoked.is_none()) {
-        slice.look(1);
+        slice.count_looks(1);
         match bound(&robot.robot_id, task, intake) {
             Ok(()) => return Ok(()),
             Err(reason) => *against.entry(reason.code).or_default() += 1,

@@ -63,7 +63,7 @@ pub fn report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
     } else if a.phase.transitions().contains(&live) {
         a.phase = live;
     }
-    tx.put(a, "errand.changed");
+    tx.put_row(a, "errand.changed");
 }
 
 /// The robot has come to the charger that it was sent to.
@@ -79,7 +79,7 @@ pub fn stop(tx: &mut Tx, robot_id: &RobotId) {
     }
     a.phase = AttemptPhase::Stopping;
     disarm(tx, TimerKind::OfferAck, &a.attempt);
-    tx.put(a, "errand.stopping");
+    tx.put_row(a, "errand.stopping");
 }
 
 /// A timer of an errand fired: an unanswered offer is taken back; everything else waits for the robot's report.
@@ -96,7 +96,7 @@ pub fn fire(tx: &mut Tx, timer: &Timer) {
 pub fn lease_over(tx: &mut Tx, robot_id: &RobotId, cause: Reason) {
     let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
     a.uncertain = Some(Uncertain { since: tx.now.utc, cause });
-    tx.put(a, "errand.uncertain");
+    tx.put_row(a, "errand.uncertain");
 }
 
 /// The robot is heard again and still lists its errand.
@@ -108,5 +108,5 @@ pub fn seen(tx: &mut Tx, robot_id: &RobotId) {
         a.phase = AttemptPhase::Accepted;
         disarm(tx, TimerKind::OfferAck, &a.attempt);
     }
-    tx.put(a, "errand.seen");
+    tx.put_row(a, "errand.seen");
 }

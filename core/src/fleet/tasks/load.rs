@@ -63,7 +63,7 @@ pub(in crate::fleet) fn end_word(tx: &mut Tx, live: &Live) {
     let is_confirmed = (session_epoch, hb) > (word.session_epoch, word.hb) && live.report.load.is_none();
     if is_confirmed || session_epoch > word.session_epoch {
         let control = RobotControl { load_settled: None, ..control.clone() };
-        tx.put(control, "robot.load_word_over");
+        tx.put_row(control, "robot.load_word_over");
     }
 }
 

@@ -29,7 +29,7 @@ struct Bounds {
 
 impl Bounds {
     /// Those of `a`; none if nothing is known of its steps any more.
-    fn of(view: &FleetProjection, a: &Attempt) -> Option<Self> {
+    fn of_attempt(view: &FleetProjection, a: &Attempt) -> Option<Self> {
         let given = view.desired_work.get(a.robot_id.as_str()).and_then(|d| d.row.assignment.as_ref());
         if let Some(given) = given.filter(|given| given.attempt == a.attempt) {
             let steps = given.steps.len() as u32;
@@ -73,7 +73,7 @@ pub fn judge(
     if matches!(state, WorkState::Unknown(_)) && view.bugs.unknown_states_are_taken() {
         return None;
     }
-    let bounds = Bounds::of(view, a)?;
+    let bounds = Bounds::of_attempt(view, a)?;
     let least = bounds.least(a.reported, a.step_index);
     let reason = || {
         Reason::from(Code::ReportImplausible)

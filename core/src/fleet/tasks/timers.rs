@@ -66,7 +66,7 @@ pub fn fire(tx: &mut Tx, timer: &Timer, board: &Board) {
     disarm(tx, timer.kind, &timer.attempt);
     if current {
         let why = Reason::from(code);
-        happen(tx, &task_id, News::of(event, Some(&why)));
+        happen(tx, &task_id, News::from_event(event, Some(&why)));
     }
 }
 
@@ -88,7 +88,7 @@ fn winds_down(tx: &Tx, task_id: &TaskId, attempt: &AttemptId, board: &Board) -> 
 /// The deadline of a task passed.
 pub fn deadline(tx: &mut Tx, task_id: &TaskId) {
     let why: Reason = Code::DeadlinePassed.into();
-    happen(tx, task_id, News::of(Event::Deadline, Some(&why)));
+    happen(tx, task_id, News::from_event(Event::Deadline, Some(&why)));
 }
 
 /// The schedule_to_start of a task counts while it is ready, from when it began to wait, and stands still while it is not.
@@ -107,12 +107,12 @@ pub(in crate::fleet) fn count_readiness(tx: &mut Tx, task_id: &TaskId) {
         }
         (true, Some(mut timer)) if timer.fires_at_service_ms.is_none() => {
             timer.fires_at_service_ms = Some(served + timer.remaining_ms);
-            tx.put(timer, "timer.changed");
+            tx.put_row(timer, "timer.changed");
         }
         (false, Some(mut timer)) => {
             let Some(at) = timer.fires_at_service_ms.take() else { return };
             timer.remaining_ms = at.saturating_sub(served);
-            tx.put(timer, "timer.changed");
+            tx.put_row(timer, "timer.changed");
         }
         _ => {}
     }

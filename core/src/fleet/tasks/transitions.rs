@@ -29,7 +29,7 @@ pub struct News<'a> {
 
 impl<'a> News<'a> {
     /// An event without a report.
-    pub fn of(event: Event, why: Option<&'a Reason>) -> Self {
+    pub fn from_event(event: Event, why: Option<&'a Reason>) -> Self {
         Self { event, why, report: None }
     }
 }
@@ -164,7 +164,7 @@ fn move_attempt(tx: &mut Tx, mut a: Attempt, step: Next, news: &News, intake: &T
     {
         a.phase = phase;
     }
-    tx.put(a.clone(), "attempt.changed");
+    tx.put_row(a.clone(), "attempt.changed");
     a
 }
 
@@ -184,7 +184,7 @@ pub fn end_attempt(tx: &mut Tx, a: &mut Attempt) {
     a.uncertain = None;
     disarm_all(tx, &a.attempt);
     if tx.view.held_by(&a.robot_id) == Some(&a.attempt) {
-        tx.put(RobotAuthority { robot_id: a.robot_id.clone(), holder: RobotHolder::None }, "robot.freed");
+        tx.put_row(RobotAuthority { robot_id: a.robot_id.clone(), holder: RobotHolder::None }, "robot.freed");
     }
     revoke_unentered(tx, &a.robot_id);
     lift_quarantine(tx, &a.robot_id);
@@ -210,7 +210,7 @@ fn count(tx: &mut Tx, a: &Attempt) {
             _ => {}
         }
     }
-    tx.put(counter, "robot.counted");
+    tx.put_row(counter, "robot.counted");
 }
 
 /// Counts the hours of a robot that ends no attempt.
@@ -219,7 +219,7 @@ pub fn count_hours(tx: &mut Tx, robot_id: &RobotId) {
     if let Some(session) = tx.view.sessions.get(robot_id.as_str()).filter(|_| due) {
         let software = session.row.inventory.software.clone();
         let counter = counter(tx, robot_id, &software);
-        tx.put(counter, "robot.counted");
+        tx.put_row(counter, "robot.counted");
     }
 }
 
@@ -251,7 +251,7 @@ pub fn revoke_unentered(tx: &mut Tx, robot_id: &RobotId) {
             continue;
         };
         holder.state = HolderState::Revoking;
-        tx.put(place, "place.revoked");
+        tx.put_row(place, "place.revoked");
     }
 }
 
@@ -264,7 +264,7 @@ fn quarantine(tx: &mut Tx, robot_id: &RobotId, why: Option<&Reason>) {
             let cause = why.map_or(Code::Forced, |r| r.code);
             place.quarantine =
                 Some(Reason::from(Code::PlaceQuarantined).with("robot_id", robot_id).with("cause", cause));
-            tx.put(place, "place.quarantined");
+            tx.put_row(place, "place.quarantined");
         }
     }
 }
@@ -279,7 +279,7 @@ pub fn lift_quarantine(tx: &mut Tx, robot_id: &RobotId) {
             .is_some_and(|q| q.metadata.get("robot_id").is_some_and(|r| r == robot_id.as_str()));
         if ours {
             place.quarantine = None;
-            tx.put(place, "place.quarantine_lifted");
+            tx.put_row(place, "place.quarantine_lifted");
         }
     }
 }
@@ -325,7 +325,7 @@ fn move_task(tx: &mut Tx, mut t: TaskState, a: Option<&Attempt>, step: Next, new
         t.reason = wanted.or(t.reason);
     }
     hold_timer(tx, &t, was);
-    tx.put(t, kind_of(step.phase));
+    tx.put_row(t, kind_of(step.phase));
 }
 
 fn count_end(t: &mut TaskState, a: &Attempt, news: &News, step: Next) {
@@ -458,7 +458,7 @@ fn hold_timer(tx: &mut Tx, t: &TaskState, was: Phase) {
         (Phase::Held, Phase::Running, None) => timer.fires_at_service_ms = Some(served + timer.remaining_ms),
         _ => return,
     }
-    tx.put(timer, "timer.changed");
+    tx.put_row(timer, "timer.changed");
 }
 
 /// Sets a deadline `after_ms` of its own clock from now.
@@ -466,7 +466,7 @@ pub fn arm(tx: &mut Tx, kind: TimerKind, attempt: &AttemptId, after_ms: u64) {
     let served = tx.view.serving(&tx.now);
     let base = if kind.is_site() { served.site_ms } else { served.link_ms };
     let timer = Timer { kind, attempt: attempt.clone(), fires_at_service_ms: Some(base + after_ms), remaining_ms: 0 };
-    tx.put(timer, "timer.armed");
+    tx.put_row(timer, "timer.armed");
 }
 
 /// Takes a deadline away, if there is one.
@@ -528,5 +528,5 @@ pub(in crate::fleet) fn release(tx: &mut Tx, robot_id: &RobotId, report: &Attemp
     a.stats = report.stats;
     a.phase = AttemptPhase::Aborted;
     end_attempt(tx, &mut a);
-    tx.put(a, "attempt.released");
+    tx.put_row(a, "attempt.released");
 }

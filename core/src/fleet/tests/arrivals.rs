@@ -53,7 +53,7 @@ fn attempt(rig: &Rig) -> AttemptId {
 }
 
 /// Fleet takes this from the robot's inbox.
-fn take(rig: &mut Rig, what: InboxItem) {
+fn arrive(rig: &mut Rig, what: InboxItem) {
     let ring = String::new();
     let lane = Lane::Event;
     let entry = InboxEntry { robot_id: robot_id(), session_epoch: 1, ring, lane, what, stamp_in_future: false };
@@ -62,7 +62,7 @@ fn take(rig: &mut Rig, what: InboxItem) {
 }
 
 fn says(rig: &mut Rig, event: RobotEvent) {
-    take(rig, InboxItem::Sample(Sample { seq: 1, robot_unix_ms: 0, body: SampleBody::Event(event) }));
+    arrive(rig, InboxItem::Sample(Sample { seq: 1, robot_unix_ms: 0, body: SampleBody::Event(event) }));
 }
 
 fn reports(rig: &mut Rig, state: WorkState, step_index: u32) {
@@ -236,9 +236,9 @@ fn what_nobody_can_tell_is_believed() {
 const BREAKS: [(&str, Excuse); 3] = [
     ("events were lost", &|rig| {
         let reason = Code::Overflow.into();
-        take(rig, InboxItem::Gap(Gap { lane: Lane::Event, from_seq: 1, to_seq: 1, reason }));
+        arrive(rig, InboxItem::Gap(Gap { lane: Lane::Event, from_seq: 1, to_seq: 1, reason }));
     }),
-    ("an event could not be read", &|rig| take(rig, InboxItem::Poison { seq: 1, detail: "bytes".to_owned() })),
+    ("an event could not be read", &|rig| arrive(rig, InboxItem::Poison { seq: 1, detail: "bytes".to_owned() })),
     ("it writes in another ring", &|rig| {
         rig.view.sessions.get_mut("r1").expect("a session").row.ring = "another".to_owned();
     }),

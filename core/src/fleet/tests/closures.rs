@@ -21,7 +21,7 @@ fn silent(state: HolderState) -> Rig {
     let mut place = places::fresh(rig.view.site.place(ix));
     let (robot_id, since) = (RobotId::parse("r1").expect("an id"), rig.now.utc);
     place.holders.push(PlaceHolder { robot_id, grant_id: 7, state, since, claimed: false });
-    Plan::default().decide(&mut rig.view, rig.now, "fleet", |tx| tx.put(place, "place.granted"));
+    Plan::default().decide(&mut rig.view, rig.now, "fleet", |tx| tx.put_row(place, "place.granted"));
     rig
 }
 
@@ -64,7 +64,7 @@ fn a_closed_seat_has_one_incident_with_robot_and_command_that_closes_once_the_pl
     assert!(reason.message.contains("`midshift zone clear wait-a --reason TEXT --if-match ETAG`"), "{reason:?}");
     let mut place = rig.view.places["wait-a"].row.clone();
     place.holders.clear();
-    Plan::default().decide(&mut rig.view, rig.now, "fleet", |tx| tx.put(place, "place.left"));
+    Plan::default().decide(&mut rig.view, rig.now, "fleet", |tx| tx.put_row(place, "place.left"));
     assert_eq!(open_after(&mut rig, 1), []);
 }
 

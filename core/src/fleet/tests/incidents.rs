@@ -61,7 +61,7 @@ fn robots_that_crowd_one_place_are_one_incident_that_names_a_few_and_counts_all(
         let (state, since) = (HolderState::Inside, rig.now.utc);
         place.holders.push(PlaceHolder { robot_id: robot_id.clone(), grant_id: 0, state, since, claimed: true });
         plan.decide(&mut rig.view, rig.now, "fleet", |tx| {
-            tx.put(place.clone(), "place.adopted");
+            tx.put_row(place.clone(), "place.adopted");
             claims::entered(tx, &robot_id, &place_id);
         });
         rig.pass(1_000);

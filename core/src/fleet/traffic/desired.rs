@@ -74,7 +74,7 @@ pub fn compose(tx: &mut Tx, robot_id: &RobotId, board: &Board, releases: &Releas
         return;
     }
     let generation = next_generation(tx.view, robot_id, &tx.now).max(followed + 1);
-    tx.put(DesiredWork { generation, ..new }, "work.desired");
+    tx.put_row(DesiredWork { generation, ..new }, "work.desired");
 }
 
 /// A robot nobody has asked anything of.
@@ -245,5 +245,5 @@ pub fn compose_policy(tx: &mut Tx, robot_id: &RobotId) {
         return;
     }
     let generation = (old.map_or(0, |o| o.generation) + 1).max(tx.now.wall.0.max(0) as u64);
-    tx.put(DesiredPolicy { robot_id: robot_id.clone(), generation, areas }, "policy.desired");
+    tx.put_row(DesiredPolicy { robot_id: robot_id.clone(), generation, areas }, "policy.desired");
 }

@@ -72,7 +72,7 @@ pub fn advance(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut P
     view.waits.retain(|r, _| wanting.contains(r));
     wishes.sort_by(|a, b| (a.patient, a.class, a.since, &a.robot_id).cmp(&(b.patient, b.class, b.since, &b.robot_id)));
     let mut releases = Releases::default();
-    let mut traffic = if wishes.is_empty() { Traffic::default() } else { Traffic::of(view) };
+    let mut traffic = if wishes.is_empty() { Traffic::default() } else { Traffic::from_projection(view) };
     for wish in &wishes {
         if plan.is_cut() {
             break;
@@ -98,7 +98,7 @@ fn bars_passage(view: &FleetProjection, robot_id: &RobotId) -> bool {
 
 fn class_of(view: &FleetProjection, a: &Attempt) -> Class {
     let priority = a.attempt.subject.task_id().and_then(|t| view.intake(t)).map_or(9, |i| i.spec.priority);
-    Class::of(priority, 0)
+    Class::from_priority(priority, 0)
 }
 
 /// An accepted attempt of a robot that is heard, not held and not told to stop.
@@ -160,7 +160,7 @@ struct Traffic {
 }
 
 impl Traffic {
-    fn of(view: &FleetProjection) -> Self {
+    fn from_projection(view: &FleetProjection) -> Self {
         let mut traffic = Self { blocked: engaged_stops::closed(view), ..Self::default() };
         let standing = view.site.places().iter().filter(|p| p.waypoint().is_some());
         for place in standing {
@@ -235,7 +235,7 @@ fn note_wait(tx: &mut Tx, robot_id: &RobotId, since: SiteTime) {
     let is_noted = |at: Utc| tx.now.ms_since(at) < limits::PLACE_WAIT_NOTED.as_ms();
     if !control.waited_for_place.is_some_and(is_noted) {
         let control = RobotControl { waited_for_place: Some(tx.now.utc), ..control.clone() };
-        tx.put(control, "robot.waits");
+        tx.put_row(control, "robot.waits");
     }
 }
 
@@ -307,7 +307,7 @@ fn grant(tx: &mut Tx, robot_id: &RobotId, needed: &[PlaceIx], traffic: &mut Traf
                 since: tx.now.utc,
                 claimed: false,
             });
-            tx.put(place, "place.granted");
+            tx.put_row(place, "place.granted");
         }
     }
 }

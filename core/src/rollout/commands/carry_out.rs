@@ -115,7 +115,7 @@ fn carry_out_one(tx: &mut Tx, board: &Board, command: &Command, actor: &Actor) {
     match command {
         Command::Create { rollout_id, spec } => {
             let row = draft(tx, rollout_id, spec.clone(), actor);
-            tx.put(row, "rollout.created");
+            tx.put_row(row, "rollout.created");
         }
         Command::Rollback { of, rollout_id } => {
             let Some(original) = tx.view.rollout(of).cloned() else { return };
@@ -129,13 +129,13 @@ fn carry_out_one(tx: &mut Tx, board: &Board, command: &Command, actor: &Actor) {
                 ..RolloutSpec::clone(&original.spec)
             };
             let row = draft(tx, rollout_id, Arc::new(spec), actor);
-            tx.put(Rollout { revert_of: Some(of.clone()), ..row }, "rollout.created");
+            tx.put_row(Rollout { revert_of: Some(of.clone()), ..row }, "rollout.created");
         }
         Command::Do { rollout_id, verb, reason } => carry_out_verb(tx, board, rollout_id, verb, actor, reason),
         Command::Revoke { bundle, reason } => {
             let Some(row) = tx.view.bundles.get(bundle.as_str()).map(|b| b.row.clone()) else { return };
             let revoked = Some(compose_act(tx, actor, reason));
-            tx.put(Bundle { revoked, ..row }, "bundle.revoked");
+            tx.put_row(Bundle { revoked, ..row }, "bundle.revoked");
             let is_of = |r: &&Rollout| r.spec.bundle == *bundle && r.revert_of.is_none();
             let of: Vec<Rollout> = tx.view.rollouts.values().map(|r| &r.row).filter(is_of).cloned().collect();
             of.into_iter().for_each(|rollout| pauses::revoke(tx, rollout));
@@ -143,11 +143,11 @@ fn carry_out_one(tx: &mut Tx, board: &Board, command: &Command, actor: &Actor) {
         Command::Pin { robot_id, reason } => {
             let pin = Some(compose_act(tx, actor, reason));
             let row = tx.view.software_of(robot_id);
-            tx.put(RobotSoftware { pin, ..row }, "robot.pinned");
+            tx.put_row(RobotSoftware { pin, ..row }, "robot.pinned");
         }
         Command::Unpin { robot_id } => {
             let row = tx.view.software_of(robot_id);
-            tx.put(RobotSoftware { pin: None, ..row }, "robot.unpinned");
+            tx.put_row(RobotSoftware { pin: None, ..row }, "robot.unpinned");
             tx.view.arrived.insert(robot_id.clone());
         }
         Command::Unstick { robot_id, .. } => {
@@ -158,7 +158,7 @@ fn carry_out_one(tx: &mut Tx, board: &Board, command: &Command, actor: &Actor) {
         }
         Command::AcceptKey { robot_id, device_key } => {
             let row = tx.view.software_of(robot_id);
-            tx.put(RobotSoftware { device_key: Some(device_key.clone()), ..row }, "robot.device_key_accepted");
+            tx.put_row(RobotSoftware { device_key: Some(device_key.clone()), ..row }, "robot.device_key_accepted");
         }
         Command::LiftQuarantine { robot_id, bundle } => {
             tx.delete::<Quarantine>(&Quarantine::id_of(robot_id, bundle), "quarantine.lifted");
@@ -271,7 +271,7 @@ fn start(
                 let reason = Reason::from(Code::SupersededBy).with("rollout_id", id);
                 let old = Rollout { superseded_by: Some(id.clone()), ..old };
                 if old.phase.goes_back() {
-                    tx.put(old, "rollout.superseded");
+                    tx.put_row(old, "rollout.superseded");
                 } else {
                     advance::abort(tx, old, reason, false, None, Some(actor.to_string()));
                 }
@@ -293,7 +293,7 @@ fn start(
             counted,
             ..rollout.clone()
         };
-        tx.put(row, "rollout.started");
+        tx.put_row(row, "rollout.started");
         let supersede = Verb::Start { supersede };
         tx.audit(note_of_verb(id, &supersede, ""));
         assign::assign_robots(tx, &rollout, first);
@@ -318,7 +318,7 @@ fn retry_failed(view: &mut RolloutProjection, now: Now, id: &RolloutId, actor: &
                 let fresh =
                     assign::new_robot(&tx.now.clone(), &rollout, &r.robot_id, wave, r.place, r.from_version.clone());
                 let why = (!reason.is_empty()).then(|| Reason::new(Code::RetriedByUser, reason).with("actor", actor));
-                tx.put(RolloutRobot { again: true, why, ..fresh }, "robot.retried");
+                tx.put_row(RolloutRobot { again: true, why, ..fresh }, "robot.retried");
             }
         });
     }

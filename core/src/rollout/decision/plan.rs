@@ -43,5 +43,5 @@ impl Plan {
 
 /// States that a person should look into something.
 pub(in crate::rollout) fn incident(tx: &mut Tx, robot_id: Option<&RobotId>, reason: &Reason) {
-    tx.tell(robot_id.map_or("", RobotId::as_str), INCIDENT, reason);
+    tx.add_fact(robot_id.map_or("", RobotId::as_str), INCIDENT, reason);
 }

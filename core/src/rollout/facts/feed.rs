@@ -34,7 +34,7 @@ pub fn absorb(view: &mut RolloutProjection, now: Now, entries: &[Entry], plan: &
             let mut tx = Tx::new(view, now, "ota");
             let reason = Reason::from(Code::EntryPassedOver).with("seq", entry.seq.0).with("kind", &entry.kind);
             incident(&mut tx, None, &reason);
-            tx.put(OtaMark { seq: entry.seq }, "ota.consumed");
+            tx.put_row(OtaMark { seq: entry.seq }, "ota.consumed");
             plan.items.extend(tx.finish());
             continue;
         }
@@ -43,7 +43,7 @@ pub fn absorb(view: &mut RolloutProjection, now: Now, entries: &[Entry], plan: &
                 let mut tx = Tx::new(view, now, said.robot_id.as_str());
                 reports::obey_event(&mut tx, &said);
                 if tx.rows() > 0 {
-                    tx.put(OtaMark { seq: entry.seq }, "ota.consumed");
+                    tx.put_row(OtaMark { seq: entry.seq }, "ota.consumed");
                 } else {
                     tx.view.passed = entry.seq;
                 }

@@ -60,12 +60,12 @@ fn take_report(tx: &mut Tx, robot_id: &RobotId, report: &UpdateReport) {
     }
     software.report = Some(report.clone());
     software.since = tx.now.utc;
-    tx.put(software, "robot.software_changed");
+    tx.put_row(software, "robot.software_changed");
 }
 
 fn note_ready(tx: &mut Tx, robot_id: &RobotId, drain_id: &DrainId) {
     let Some(robot) = in_drain(tx.view, robot_id, drain_id).cloned() else { return };
-    tx.put(RolloutRobot { ready: true, ..robot }, "robot.ready");
+    tx.put_row(RolloutRobot { ready: true, ..robot }, "robot.ready");
 }
 
 /// The robot in the roll-out whose drain this is. A robot that speaks of a drain of before is not heard.
@@ -94,7 +94,7 @@ fn note_way_back_refused(tx: &mut Tx, robot_id: &RobotId, generation: u64, reaso
     };
     if row.way_back.refused.is_none() {
         row.way_back.refused = Some(reason.clone());
-        tx.put(row, "robot.way_back_refused");
+        tx.put_row(row, "robot.way_back_refused");
     }
 }
 
@@ -145,7 +145,7 @@ pub fn repair(tx: &mut Tx, live: &Live) {
     let area = tx.view.area_of(live).or_else(|| known.area.clone());
     if known.version != version || known.area != area {
         let known = tx.view.software_of(robot_id);
-        tx.put(RobotSoftware { version, area, ..known }, "robot.software_seen");
+        tx.put_row(RobotSoftware { version, area, ..known }, "robot.software_seen");
     }
 }
 

@@ -85,6 +85,6 @@ pub fn reconsider_ending(tx: &mut Tx, id: &RolloutId) {
     let was_short = rollout.phase == Phase::Completed && rollout.outcome == Some(Ending::Incomplete);
     if was_short && judge_ending(tx.view, &rollout) == Ending::Complete {
         serve_newcomers(tx, &rollout);
-        tx.put(Rollout { outcome: Some(Ending::Complete), ..rollout }, "rollout.complete_after_all");
+        tx.put_row(Rollout { outcome: Some(Ending::Complete), ..rollout }, "rollout.complete_after_all");
     }
 }

@@ -11,7 +11,7 @@ pub fn fail(tx: &mut Tx, robot: &RolloutRobot, reason: Reason) {
     let Some(robot) = tx.view.robot_of(&robot.rollout_id, &robot.robot_id).cloned() else { return };
     let is_worse = is_hard(&reason) && !robot.failure.as_ref().is_some_and(is_hard);
     if robot.failure.is_none() || is_worse {
-        tx.put(RolloutRobot { failure: Some(reason), ..robot }, "robot.failed");
+        tx.put_row(RolloutRobot { failure: Some(reason), ..robot }, "robot.failed");
     }
 }
 
@@ -30,5 +30,5 @@ pub fn quarantine(tx: &mut Tx, robot: &RolloutRobot, reason: &Reason) {
         reason: reason.clone(),
         since: tx.now.utc,
     };
-    tx.put(row, "robot.quarantined");
+    tx.put_row(row, "robot.quarantined");
 }

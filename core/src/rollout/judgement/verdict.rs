@@ -86,7 +86,7 @@ pub fn count_tasks(tx: &mut Tx, id: &RolloutId) {
     let counted = Arc::new(Counted { at_ms, trial, control, effort: rollout.counted.effort });
     let efforts = effort::see_efforts(tx.view, rollout);
     let row = Rollout { tasks, counted, efforts, ..rollout.clone() };
-    tx.put(row, "rollout.tasks_counted");
+    tx.put_row(row, "rollout.tasks_counted");
 }
 
 /// Counts robots at the gate of its wave. Those on trial in this wave or before that are not dark count as having come

@@ -32,7 +32,7 @@ pub fn serve_newcomers(tx: &mut Tx, rollout: &Rollout) {
         let models = models.into_iter().filter(|model| row.rollouts.get(model).is_none_or(|known| !is_newer(known)));
         let models: Vec<(String, RolloutId)> = models.map(|model| (model, id.clone())).collect();
         row.rollouts.extend(models);
-        tx.put(row, "area.bundle_set");
+        tx.put_row(row, "area.bundle_set");
     }
 }
 
@@ -48,6 +48,6 @@ pub fn forget_area_bundles(tx: &mut Tx, id: &RolloutId) {
         .collect();
     for mut row in named {
         row.rollouts.retain(|_, rollout| rollout != id);
-        tx.put(row, "area.bundle_forgotten");
+        tx.put_row(row, "area.bundle_forgotten");
     }
 }

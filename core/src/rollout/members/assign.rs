@@ -12,7 +12,7 @@ use crate::time::{Now, Utc};
 pub fn assign_robots(tx: &mut Tx, rollout: &Rollout, robots: &[(RobotId, u32, u64, String)]) {
     for (robot_id, wave, place, from_version) in robots {
         let now = tx.now;
-        tx.put(new_robot(&now, rollout, robot_id, *wave, *place, from_version.clone()), "robot.assigned");
+        tx.put_row(new_robot(&now, rollout, robot_id, *wave, *place, from_version.clone()), "robot.assigned");
     }
 }
 

@@ -46,5 +46,5 @@ pub fn add_newcomer(tx: &mut Tx, board: &Board, robot_id: &RobotId, rollout: &Ro
     let place = matching::place_of(&rollout.rollout_id, robot_id);
     let from_version = matching::stratum_of(tx.view, board, robot_id).map(|s| s.from_version).unwrap_or_default();
     let row = new_robot(&tx.now, rollout, robot_id, wave, place, from_version);
-    tx.put(row, "robot.newcomer");
+    tx.put_row(row, "robot.newcomer");
 }

@@ -56,9 +56,9 @@ pub fn advance_rollout(tx: &mut Tx, board: &Board, id: &RolloutId) {
 pub fn enter_phase(tx: &mut Tx, rollout: Rollout, phase: Phase, kind: &'static str) {
     let bundle = tx.view.bundles.get(rollout.spec.bundle.as_str()).filter(|_| phase.is_over());
     if let Some(bundle) = bundle.map(|b| b.row.clone()) {
-        tx.put(Bundle { ended: Some(tx.now.utc), ..bundle }, "bundle.rollout_ended");
+        tx.put_row(Bundle { ended: Some(tx.now.utc), ..bundle }, "bundle.rollout_ended");
     }
-    tx.put(Rollout { phase, since: tx.now.utc, version: rollout.version + 1, ..rollout }, kind);
+    tx.put_row(Rollout { phase, since: tx.now.utc, version: rollout.version + 1, ..rollout }, kind);
 }
 
 /// Ends it if something speaks against its bundle. True: it ends.
@@ -133,7 +133,7 @@ fn assigns_missing(tx: &mut Tx, board: &Board, rollout: &Rollout) -> bool {
         // The others do not fit any more.
         let size = |wave| tx.view.wave_sizes.get(&(id.clone(), wave)).copied().unwrap_or_default();
         let sizes = (0..rollout.sizes.len() as u32).map(size).collect();
-        tx.put(Rollout { sizes, ..rollout.clone() }, "rollout.sized");
+        tx.put_row(Rollout { sizes, ..rollout.clone() }, "rollout.sized");
     }
     assign::assign_robots(tx, rollout, &members);
     true
@@ -152,7 +152,7 @@ fn applying(tx: &mut Tx, board: &Board, rollout: Rollout) {
     if wave < rollout.spec.waves.len() as u32 {
         let next = find_stand_ins(tx.view, board, &tx.now, &rollout);
         if !next.is_empty() {
-            next.into_iter().for_each(|next| tx.put(RolloutRobot { wave, ..next }, "robot.stands_in"));
+            next.into_iter().for_each(|next| tx.put_row(RolloutRobot { wave, ..next }, "robot.stands_in"));
             return;
         }
     }

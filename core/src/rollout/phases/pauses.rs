@@ -49,7 +49,7 @@ pub fn set_pauses(tx: &mut Tx, mut rollout: Rollout, pauses: BTreeSet<Pause>, ki
     rollout.pauses = pauses;
     rollout.resumed = runs.then_some(tx.now.utc).or(rollout.resumed);
     let id = rollout.rollout_id.clone();
-    tx.put(rollout, kind);
+    tx.put_row(rollout, kind);
     if !runs && !tx.view.bugs.pause_is_forgotten() {
         moves::take_back_asked(tx, &id);
     }

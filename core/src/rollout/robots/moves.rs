@@ -86,14 +86,14 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             r.moments.granted_link = None;
             // It never ran the bundle, so the bundle has not lost it.
             r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
-            tx.put(r, "robot.grant_not_used");
+            tx.put_row(r, "robot.grant_not_used");
         }
         Move::LeaveDrain => give_up_drain(tx, r, to),
         Move::Switched => {
             (r.moments.switched, r.moments.switched_link) = (Some(tx.now.utc), Some(stamp_now(tx)));
             // It runs, whatever the rows know of a permission: a store that was restored has forgotten some.
             r.attempted = true;
-            tx.put(r, "robot.switched");
+            tx.put_row(r, "robot.switched");
         }
         Move::OnTrial => {
             r.moments.switched.get_or_insert(tx.now.utc);
@@ -109,7 +109,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             write_step(tx, r, to, "robot.on_trial");
         }
         Move::Fail(why) => fail(tx, &r, why),
-        Move::Found => tx.put(RolloutRobot { failure: None, ..r }, "robot.found"),
+        Move::Found => tx.put_row(RolloutRobot { failure: None, ..r }, "robot.found"),
         Move::Commit => {
             change_desired(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Commit, None, None));
             write_step(tx, r, to, "robot.committing");
@@ -149,7 +149,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             let known = tx.view.software_of(&r.robot_id);
             let (committed, previous, on_trial, report) = (None, None, None, None);
             let row = RobotSoftware { committed, previous, on_trial, report, since: tx.now.utc, ..known };
-            tx.put(row, "robot.software_changed");
+            tx.put_row(row, "robot.software_changed");
             roll_back(tx, &rollout, r, to, Code::RevertAsked.into());
         }
         Move::Stuck(why) => {
@@ -166,7 +166,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
             if !r.counts() {
                 recount(tx, &r, 1);
             }
-            tx.put(RolloutRobot { lost: None, ..r }, "robot.heard_again");
+            tx.put_row(RolloutRobot { lost: None, ..r }, "robot.heard_again");
         }
     }
 }
@@ -210,7 +210,7 @@ fn stamp_now(tx: &Tx) -> Stamp {
 
 fn write_step(tx: &mut Tx, r: RolloutRobot, to: Step, kind: &'static str) {
     let since = if r.step == to { r.since } else { tx.now.utc };
-    tx.put(RolloutRobot { step: to, since, ..r }, kind);
+    tx.put_row(RolloutRobot { step: to, since, ..r }, kind);
 }
 
 /// Leaves out a robot that did not take its directive.
@@ -295,7 +295,7 @@ fn write_directive(
         rate_bytes_s: rollout.spec.rate_bytes_s,
         probation_ms: rollout.spec.probation_ms,
     };
-    tx.put(row, "update.desired");
+    tx.put_row(row, "update.desired");
     Some(generation)
 }
 
@@ -323,7 +323,7 @@ fn change_desired(tx: &mut Tx, robot_id: &RobotId, change: impl FnOnce(&mut Desi
     change(&mut new);
     if new != old {
         new.generation = next_generation(tx.view, robot_id, &tx.now);
-        tx.put(new, "update.desired");
+        tx.put_row(new, "update.desired");
     }
 }
 
@@ -338,7 +338,7 @@ fn drop_bundle(tx: &mut Tx, r: &RolloutRobot) {
 fn next_number(tx: &mut Tx, used: u64) -> u64 {
     let clock = tx.view.clocks.get("ota").map(|c| c.row).unwrap_or_default();
     let number = (clock.number.max(used) + 1).max(tx.now.wall.0.max(0) as u64);
-    tx.put(OtaClock { number, ..clock }, "ota.numbered");
+    tx.put_row(OtaClock { number, ..clock }, "ota.numbered");
     number
 }
 
@@ -369,7 +369,7 @@ fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool)
         forward: rollout.revert_of.is_none() && r.step == Step::Staged,
         written_off: !r.counts(),
     };
-    tx.put(request, "drain.requested");
+    tx.put_row(request, "drain.requested");
     r.drain_id = Some(drain_id);
     (r.ready, r.grant, r.not_used) = (false, None, false);
     if r.counts() {
@@ -380,7 +380,7 @@ fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool)
 fn leave_drain(tx: &mut Tx, r: &mut RolloutRobot, why: ReleasedBy) {
     let Some(drain_id) = r.drain_id.take() else { return };
     (r.ready, r.grant) = (false, None);
-    tx.put(DrainRelease { drain_id, why }, "drain.release");
+    tx.put_row(DrainRelease { drain_id, why }, "drain.release");
     if r.counts() {
         count_in_flight(tx, &r.rollout_id, -1);
     }
@@ -396,7 +396,7 @@ fn write_lost(tx: &mut Tx, rollout: &Rollout, mut r: RolloutRobot) {
         let act = Act { actor: "ota".to_owned(), person: None, reason, at: tx.now.utc };
         return write_off(tx, r, act);
     }
-    tx.put(r, "robot.lost");
+    tx.put_row(r, "robot.lost");
 }
 
 /// A robot that is lost counts in no budget until it is heard. It keeps its drain.
@@ -407,14 +407,14 @@ pub fn write_off(tx: &mut Tx, mut r: RolloutRobot, act: Act) {
     if counted {
         recount(tx, &r, -1);
     }
-    tx.put(r, "robot.written_off");
+    tx.put_row(r, "robot.written_off");
 }
 
 /// The drain of a robot counts for fleet and for the roll-out from now on, or does not.
 fn recount(tx: &mut Tx, r: &RolloutRobot, by: i32) {
     let request = r.drain_id.as_ref().and_then(|id| tx.view.requests.get(id.as_str())).map(|q| q.row.clone());
     if let Some(request) = request {
-        tx.put(DrainRequest { written_off: by < 0, ..request }, "drain.recounted");
+        tx.put_row(DrainRequest { written_off: by < 0, ..request }, "drain.recounted");
         count_in_flight(tx, &r.rollout_id, by);
     }
 }
@@ -447,7 +447,7 @@ pub fn take_back_asked(tx: &mut Tx, rollout_id: &RolloutId) {
 fn count_in_flight(tx: &mut Tx, rollout_id: &RolloutId, by: i32) {
     let Some(rollout) = tx.view.rollout(rollout_id).cloned() else { return };
     let in_flight = rollout.in_flight.saturating_add_signed(by);
-    tx.put(Rollout { in_flight, ..rollout }, "rollout.in_flight");
+    tx.put_row(Rollout { in_flight, ..rollout }, "rollout.in_flight");
 }
 
 fn give_grant(tx: &mut Tx, board: &Board, rollout: &Rollout, mut r: RolloutRobot) {
@@ -465,7 +465,7 @@ fn give_grant(tx: &mut Tx, board: &Board, rollout: &Rollout, mut r: RolloutRobot
     r.grant = Some(Given { grant_id, authority, generation: rollout.generation });
     r.moments.granted_link = Some(stamp_now(tx));
     r.attempted = true;
-    tx.put(r, "robot.granted");
+    tx.put_row(r, "robot.granted");
 }
 
 /// Takes requests away that fleet has nothing left to do for.

@@ -23,7 +23,7 @@ fn a_bad_bundle_never_gets_past_its_canary_and_everybody_is_back() {
 /// A roll-out of which wave 0 has committed and wave 1 is on trial.
 fn half(scope: AbortScope, irreversible: bool) -> Rig {
     let mut rig = Rig::new(6);
-    rig.put(Bundle { is_irreversible: irreversible, ..bundle(2) });
+    rig.put_row(Bundle { is_irreversible: irreversible, ..bundle(2) });
     rig.start(RolloutSpec { abort_scope: scope, soak_ms: 20_000, ..spec() });
     rig.until(200, |r| r.rollout("ro").wave == 1 && r.phase() == Phase::Soaking);
     assert_eq!((rig.count(Step::Committed), rig.count(Step::Trial)), (1, 5));
@@ -47,7 +47,7 @@ fn an_abort_takes_back_all_that_was_touched_or_only_who_is_on_trial() {
 #[test]
 fn what_cannot_be_gone_back_from_is_kept_also_while_it_is_being_committed() {
     let mut rig = Rig::new(4);
-    rig.put(Bundle { is_irreversible: true, ..bundle(2) });
+    rig.put_row(Bundle { is_irreversible: true, ..bundle(2) });
     rig.start(spec());
     rig.until(100, |r| r.count(Step::Committing) == 1);
     rig.must("ro", Verb::Abort);

@@ -19,7 +19,7 @@ impl Rig {
         };
         let body = serde_json::to_string(&entry).expect("plain fields");
         self.entry(Log::RobotInbox, None, id.as_str().into(), Some(body.into()), "robot.said");
-        self.put(LaneMark { event: seq, ..LaneMark::fresh(id, "ring") });
+        self.put_row(LaneMark { event: seq, ..LaneMark::fresh(id, "ring") });
     }
 
     /// A robot's update is in this state from now on.
@@ -195,6 +195,6 @@ impl Rig {
         }
         let energy_mwh = if self.robots[n].version == "0.9.0" { 10 } else { self.trial_energy_mwh };
         row.stats += WorkStats { path_mm: 50_000, duration_ms: 20_000, energy_mwh, ..WorkStats::default() };
-        self.put(row);
+        self.put_row(row);
     }
 }

@@ -43,7 +43,7 @@ impl Rig {
     pub(super) fn rules(&mut self, change: impl FnOnce(&mut crate::policy::SoftwareRules)) {
         let mut row = self.row("hall").unwrap_or_else(|| AreaPolicy::default_of(hall()));
         change(&mut row.software);
-        self.put(row);
+        self.put_row(row);
     }
 
     /// A session's inventory is changed, and the robot attaches anew with it.
@@ -54,14 +54,14 @@ impl Rig {
     pub(super) fn control(&mut self, n: usize, change: impl FnOnce(&mut RobotControl)) {
         let mut row = self.row::<RobotControl>(robot_id(n).as_str()).expect("a row");
         change(&mut row);
-        self.put(row);
+        self.put_row(row);
     }
 
     /// A robot shows another device key than the one that is known: this one.
     pub(super) fn shows_another_key(&mut self, n: usize) -> String {
         let key = "ab".repeat(32);
         let session = self.row::<Session>(robot_id(n).as_str()).expect("it attached");
-        self.put(Session { other_device_key: Some(key.clone()), ..session });
+        self.put_row(Session { other_device_key: Some(key.clone()), ..session });
         key
     }
 

@@ -190,15 +190,18 @@ fn robots_that_charge_are_asked_first_and_urgent_drains_do_not_wait() {
     rig.rules(|s| s.off_work_permille = 0);
     // The last of them charges: its mutex is with an errand that ends only when it is asked to.
     let id = AttemptId { subject: Subject::Errand { robot_id: robot_id(2), number: 1 }, epoch: 1 };
-    rig.put(charge(&id, Errand::Charge));
-    rig.put(RobotAuthority { robot_id: robot_id(2), holder: RobotHolder::Attempt(id) });
+    rig.put_row(charge(&id, Errand::Charge));
+    rig.put_row(RobotAuthority { robot_id: robot_id(2), holder: RobotHolder::Attempt(id) });
     for n in 0..3 {
-        rig.put(request(n, false));
+        rig.put_row(request(n, false));
     }
     rig.fleet_turn();
     let state = |rig: &Rig, n: usize| rig.fleet.drains[&format!("ota:{n}")].row.state;
     assert_eq!([0, 1, 2].map(|n| state(&rig, n)), [DrainState::Waiting, DrainState::Waiting, DrainState::Draining]);
-    rig.put(crate::maintenance::DrainRequest { drain_id: DrainId::parse("ota:9").expect("an id"), ..request(0, true) });
+    rig.put_row(crate::maintenance::DrainRequest {
+        drain_id: DrainId::parse("ota:9").expect("an id"),
+        ..request(0, true)
+    });
     rig.fleet_turn();
     let urgent = &rig.fleet.drains["ota:9"].row;
     assert!(urgent.is_on(), "{urgent:?}");
@@ -217,15 +220,15 @@ fn whoever_goes_back_from_an_aborted_bundle_does_not_wait_for_robots_that_only_a
     let now = rig.now.utc;
     rig.control(2, |c| c.breaker = Some(now));
     for n in [0, 1] {
-        rig.put(request(n, false));
+        rig.put_row(request(n, false));
     }
     rig.fleet_turn();
     let is_on = |rig: &Rig, n: usize| rig.fleet.drains[&format!("ota:{n}")].row.is_on();
     assert_eq!([0, 1].map(|n| is_on(&rig, n)), [false, false], "one may be out of work, and one is");
     for n in [3, 4] {
-        rig.put(crate::maintenance::DrainRequest { returns: true, ..request(n, false) });
+        rig.put_row(crate::maintenance::DrainRequest { returns: true, ..request(n, false) });
     }
-    rig.put(crate::maintenance::DrainRequest {
+    rig.put_row(crate::maintenance::DrainRequest {
         drain_id: DrainId::parse("ota:8").expect("an id"),
         returns: true,
         ..request(0, false)
@@ -261,7 +264,12 @@ fn opened(rig: &mut Rig, n: usize, phase: crate::task::Phase) {
         created: Utc(BEGIN),
         number: n as u64,
     };
-    rig.put(TaskState { phase, opened: Some(robot_id(n)), robot_id: Some(robot_id(n)), ..TaskState::born(&intake) });
+    rig.put_row(TaskState {
+        phase,
+        opened: Some(robot_id(n)),
+        robot_id: Some(robot_id(n)),
+        ..TaskState::born(&intake)
+    });
 }
 
 #[test]
@@ -270,7 +278,7 @@ fn a_robot_that_carries_the_item_of_a_task_that_is_tried_again_ends_it_before_it
     let mut rig = Rig::new(2);
     opened(&mut rig, 0, Phase::RetryWait);
     rig.ticks(1);
-    rig.put(request(0, false));
+    rig.put_row(request(0, false));
     rig.ticks(20);
     let drain = |rig: &Rig| rig.fleet.drains["ota:0"].row.state;
     assert_eq!(drain(&rig), DrainState::Draining);
@@ -293,7 +301,7 @@ fn a_robot_with_a_load_that_only_a_person_can_take_is_waited_for_until_its_drain
     opened(&mut rig, 0, crate::task::Phase::NeedsOperator);
     rig.robots[1].load = Some(crate::robot::Load { task_id: None, item: "box".into() });
     rig.ticks(1);
-    (0..2).for_each(|n| rig.put(request(n, false)));
+    (0..2).for_each(|n| rig.put_row(request(n, false)));
     rig.fleet_turn();
     rig.ticks(20);
     let state = |rig: &Rig, id: &str| rig.fleet.drains[id].row.state;
@@ -313,7 +321,7 @@ fn a_load_keeps_nobody_from_going_back_nor_from_a_person_who_asked_for_the_robot
     let mut plan = fleet::Plan::default();
     plan.decide(&mut rig.fleet, rig.now, "ana", |tx| drain::ask(tx, &robot_id(0), "oil", "ana", 60_000));
     rig.commit(plan.items);
-    rig.put(crate::maintenance::DrainRequest { returns: true, ..request(1, false) });
+    rig.put_row(crate::maintenance::DrainRequest { returns: true, ..request(1, false) });
     rig.ticks(3);
     let states: Vec<_> = rig.fleet.drains.values().map(|d| d.row.state).collect();
     assert_eq!(states, [DrainState::Held, DrainState::Held]);
@@ -359,15 +367,15 @@ fn charge(id: &crate::ids::AttemptId, errand: crate::task::state::Errand) -> cra
 #[test]
 fn a_request_and_its_release_together_make_no_drain_and_both_go_when_none_stands() {
     let mut rig = Rig::new(2);
-    rig.put(request(0, false));
-    rig.put(crate::maintenance::DrainRelease { drain_id: request(0, false).drain_id, why: ReleasedBy::NoGrant });
+    rig.put_row(request(0, false));
+    rig.put_row(crate::maintenance::DrainRelease { drain_id: request(0, false).drain_id, why: ReleasedBy::NoGrant });
     rig.fleet_turn();
     assert!(rig.fleet.drains.is_empty());
     rig.ota_turn();
     assert!(rig.ota.requests.is_empty() && rig.ota.releases.is_empty());
-    rig.put(request(1, false));
+    rig.put_row(request(1, false));
     rig.fleet_turn();
-    rig.put(crate::maintenance::DrainRelease { drain_id: request(1, false).drain_id, why: ReleasedBy::NoGrant });
+    rig.put_row(crate::maintenance::DrainRelease { drain_id: request(1, false).drain_id, why: ReleasedBy::NoGrant });
     rig.ota_turn();
     assert_eq!(rig.ota.requests.len(), 1, "the drain stands");
     rig.fleet_turn();

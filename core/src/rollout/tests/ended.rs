@@ -44,7 +44,7 @@ fn a_roll_out_that_has_ended_is_let_go_of_with_all_its_robots_and_nobody_asks_fo
 fn one_that_the_feed_speaks_of_is_not_taken_in_part_and_comes_back_whole() {
     let mut rig = let_go();
     let tried_again = RolloutRobot { step: Step::Waiting, again: true, ..rig.robot_in("ro", 2) };
-    rig.put(tried_again);
+    rig.put_row(tried_again);
     let entries = rig.feed[rig.ota_at..].to_vec();
     rig.ota_at = rig.feed.len();
     absorb(&mut rig.ota, rig.now, &entries, &mut Plan::default());
@@ -79,7 +79,7 @@ fn one_that_newcomers_get_and_one_that_another_takes_back_stay() {
 fn one_that_is_named_and_is_not_there_is_asked_for_once() {
     let mut rig = let_go();
     let rollouts = BTreeMap::from([("m1".to_owned(), rollout_id("gone"))]);
-    rig.put(AreaBundle { area_id: AreaId::parse("quality").expect("an id"), rollouts });
+    rig.put_row(AreaBundle { area_id: AreaId::parse("quality").expect("an id"), rollouts });
     rig.ota_turn();
     assert_eq!(wanted(&rig), [rollout_id("gone")]);
     rig.ota.absorb_past(rig.ota.wanted(), &[]).expect("nothing to read");

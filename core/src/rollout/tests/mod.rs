@@ -194,7 +194,7 @@ impl Rig {
         };
         rig.rules(|s| s.off_work_permille = 1_000);
         for n in 1..=3 {
-            rig.put(bundle(n));
+            rig.put_row(bundle(n));
         }
         (0..count).for_each(|_| rig.arrive());
         rig.tick();
@@ -221,9 +221,9 @@ impl Rig {
             load: None,
             at: BAY,
         });
-        self.put(RobotAuthority { robot_id: id.clone(), holder: RobotHolder::None });
+        self.put_row(RobotAuthority { robot_id: id.clone(), holder: RobotHolder::None });
         self.stand(&id);
-        self.put(RobotControl::new(id));
+        self.put_row(RobotControl::new(id));
         self.attach(self.robots.len() - 1, |_| {});
     }
 
@@ -243,7 +243,7 @@ impl Rig {
             cleared: Vec::new(),
         });
         place.holders.push(holder);
-        self.put(place);
+        self.put_row(place);
     }
 
     /// A robot begins a new session, with a changed inventory.
@@ -262,7 +262,7 @@ impl Rig {
         inventory.software.clone_from(&robot.version);
         change(&mut inventory);
         let row = Session { ring: "ring".into(), ..Session::new(robot.id.clone(), robot.epoch, inventory) };
-        self.put(row);
+        self.put_row(row);
     }
 
     // --- the store
@@ -304,7 +304,7 @@ impl Rig {
     }
 
     /// Somebody else's row.
-    fn put<R: Record>(&mut self, record: R) {
+    fn put_row<R: Record>(&mut self, record: R) {
         self.write(record.key(), Some(record.body()), "test.put");
     }
 

@@ -36,7 +36,7 @@ fn who_comes_after_gets_the_bundle_too_one_by_one() {
 #[test]
 fn who_came_while_it_ran_gets_it_when_it_is_completed() {
     let mut rig = Rig::new(4);
-    rig.put(AreaBundle { area_id: AreaId::parse("quality").expect("an id"), rollouts: BTreeMap::new() });
+    rig.put_row(AreaBundle { area_id: AreaId::parse("quality").expect("an id"), rollouts: BTreeMap::new() });
     rig.start(spec());
     rig.ticks(5);
     rig.arrive();

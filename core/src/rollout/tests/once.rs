@@ -64,7 +64,7 @@ fn world() -> Rig {
     rig.fates(Fate::BadAtStart);
     rig.start(spec());
     rig.until(300, |r| r.phase() == Phase::Aborted);
-    rig.put(bundle(3));
+    rig.put_row(bundle(3));
     rig.ticks(1);
     rig.start_as("next", RolloutSpec { bundle: bundle_id(3), ..spec() }, false);
     rig

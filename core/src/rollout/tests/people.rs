@@ -63,10 +63,10 @@ fn a_bundle_that_is_taken_back_pauses_its_roll_outs_and_one_that_is_listed_again
     rig.start(spec());
     rig.until(60, |r| r.phase() == Phase::Soaking);
     let revoked = BTreeSet::from([crate::rollout::projection::rows::Pause::Revoked]);
-    rig.put(Bundle { listed: false, ..bundle(2) });
+    rig.put_row(Bundle { listed: false, ..bundle(2) });
     rig.ticks(2);
     assert_eq!(rig.rollout("ro").pauses, revoked);
-    rig.put(bundle(2));
+    rig.put_row(bundle(2));
     rig.ticks(2);
     assert!(rig.rollout("ro").pauses.is_empty());
     rig.ask(&Command::Revoke { bundle: bundle_id(2), reason: "leaks".into() }).expect("allowed");

@@ -59,7 +59,7 @@ fn robots_name_what_they_run_try_would_go_back_to_and_fetch() {
     (robot.committed, robot.previous) = (Some(bundle_id(1)), Some(bundle_id(7)));
     (robot.on_trial, robot.report) =
         (Some(bundle_id(8)), Some(fresh_report(UpdateState::Downloading, &bundle_id(9), 1)));
-    rig.put(robot);
+    rig.put_row(robot);
     let mut view = rig.rebuilt();
     assert_eq!(needed_bundles(&view, &rig.now), bundles([1, 7, 8, 9]));
     rig.retire(0);

@@ -72,7 +72,7 @@ fn a_completed_roll_out_is_taken_back_by_another() {
 #[test]
 fn what_cannot_be_gone_back_from_is_not_rolled_back() {
     let mut rig = Rig::new(3);
-    rig.put(Bundle { is_irreversible: true, ..bundle(2) });
+    rig.put_row(Bundle { is_irreversible: true, ..bundle(2) });
     rig.start(spec());
     rig.until(200, |r| r.phase() == Phase::Completed);
     rig.ticks(4);

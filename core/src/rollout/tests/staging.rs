@@ -152,7 +152,7 @@ fn robots_that_another_roll_out_keeps_for_ever_are_passed_over() {
     let n = rig.order()[2];
     let mut kept = rig.robot_in("ro", n);
     kept.step = Step::Committing;
-    rig.put(kept);
+    rig.put_row(kept);
     rig.report(n, UpdateState::Trial);
     rig.robots[n].report = None;
     rig.checks_rebuild = false;

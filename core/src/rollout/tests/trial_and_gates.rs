@@ -289,7 +289,7 @@ fn ended_by(rig: &Rig) -> Option<(Code, Option<String>)> {
 fn quality_acts(rig: &mut Rig) {
     let mut rules = AreaPolicy::default_of(AreaId::parse("quality").expect("an id"));
     rules.software.acts_on_rates = true;
-    rig.put(rules);
+    rig.put_row(rules);
 }
 
 #[test]
@@ -332,7 +332,7 @@ fn rules_of_an_area_with_a_robot_that_was_given_permission_and_never_ran_it_end_
         rig.robots[dawdles].at = "door-2";
         rig.ticks(2);
         let given = RolloutRobot { attempted: true, ..rig.robot_in("ro", dawdles) };
-        rig.put(given);
+        rig.put_row(given);
         rig.ota_turn();
         let row = rig.robot_in("ro", dawdles);
         assert!(row.attempted && row.moments.on_trial.is_none());

@@ -135,10 +135,10 @@ fn who_is_left_out_is_told_with_the_reason() {
 #[test]
 fn a_dry_run_tells_who_has_too_little_room_and_who_lacks_what_the_bundle_needs() {
     let mut rig = Rig::new(4);
-    rig.put(Bundle { requires: [("map".to_owned(), "1.2.0".to_owned())].into(), ..bundle(2) });
+    rig.put_row(Bundle { requires: [("map".to_owned(), "1.2.0".to_owned())].into(), ..bundle(2) });
     for (n, free_bytes, map) in [(0, 1_199, Some("1.2.0")), (1, 1_200, Some("1.1.9")), (2, u64::MAX, None)] {
         let session = rig.row::<Session>(robot_id(n).as_str()).expect("it attached");
-        rig.put(Session { installed: Some(installed(n, free_bytes, map)), ..session });
+        rig.put_row(Session { installed: Some(installed(n, free_bytes, map)), ..session });
     }
     rig.tick();
     let run = dry_run(&rig.ota, &rig.board, &rollout_id("ro"), &spec()).expect("it may run");

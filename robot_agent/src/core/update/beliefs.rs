@@ -228,7 +228,7 @@ impl AgentCore {
     /// expire, nor with its key.
     pub(super) fn is_the_newest(&self, desired: &DesiredUpdate) -> bool {
         let software = &self.kept.ledger.software;
-        if software.envelope == Some(Digest::of(desired.directive.as_bytes())) {
+        if software.envelope == Some(Digest::of_content(desired.directive.as_bytes())) {
             return true;
         }
         let newest = software.directive;

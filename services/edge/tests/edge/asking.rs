@@ -175,7 +175,7 @@ async fn stops_a_full_port(bugs: Bugs) -> bool {
 #[tokio::test]
 async fn a_stop_finds_room_in_a_full_port_and_where_classes_are_alike_it_does_not() {
     assert!(stops_a_full_port(Bugs::default()).await);
-    assert!(!stops_a_full_port(Bugs::of(&[SeededBug::ClassesAreAlike])).await);
+    assert!(!stops_a_full_port(Bugs::seeded(&[SeededBug::ClassesAreAlike])).await);
 }
 
 /// Whether a port that was full serves again when all that filled it has ended.
@@ -200,7 +200,7 @@ async fn serves_again(bugs: Bugs) -> bool {
 #[tokio::test]
 async fn a_port_that_was_full_serves_again_and_where_seats_are_kept_it_never_does() {
     assert!(serves_again(Bugs::default()).await);
-    assert!(!serves_again(Bugs::of(&[SeededBug::SeatsAreKept])).await);
+    assert!(!serves_again(Bugs::seeded(&[SeededBug::SeatsAreKept])).await);
 }
 
 #[tokio::test]

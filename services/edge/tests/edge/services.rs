@@ -47,7 +47,7 @@ async fn answer(request: Request<Body>, poked: Arc<Notify>) -> Response<Body> {
     let path = request.uri().path().to_owned();
     if request.headers().contains_key("deny") {
         let reason = Reason::from(Code::NotThisRobot).with("robot_id", "r8");
-        Denying::of(&tonic::Request::from_http(request)).tell(&Refusal::new(Kind::Denied, reason));
+        Denying::from_request(&tonic::Request::from_http(request)).report(&Refusal::new(Kind::Denied, reason));
         return ok(Vec::new());
     }
     if request.headers().contains_key("hold") {

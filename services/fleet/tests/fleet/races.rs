@@ -7,7 +7,7 @@ use midshift_core::task::Phase;
 
 #[tokio::test(start_paused = true)]
 async fn two_reconcilers_at_saturation_give_no_robot_two_holders_and_every_task_is_done() {
-    let mut w = World::with(DEMO, Bugs::of(&[SeededBug::EverybodyLeads])).await;
+    let mut w = World::with(DEMO, Bugs::seeded(&[SeededBug::EverybodyLeads])).await;
     w.second_reconciler();
     w.pass(11).await;
     let stands = ["park-1", "park-1", "park-2", "park-2", "park-3", "park-3", "park-4", "park-4"];

@@ -7,7 +7,7 @@ use midshift_core::task::Phase;
 use midshift_core::work::WorkState;
 
 async fn world(bugs: &[SeededBug]) -> World {
-    let mut w = World::with(CORRIDOR, Bugs::of(bugs)).await;
+    let mut w = World::with(CORRIDOR, Bugs::seeded(bugs)).await;
     w.pass(11).await;
     w
 }
@@ -100,7 +100,7 @@ async fn silence_frees_no_place_and_a_rule_that_does_lets_a_second_robot_in() {
 
 /// Two reconcilers plan for the same robots at once. Whether all they wrote keeps the laws.
 async fn two_planners(blind: bool) -> bool {
-    let mut w = World::with(DEMO, Bugs::of(&[SeededBug::EverybodyLeads])).await;
+    let mut w = World::with(DEMO, Bugs::seeded(&[SeededBug::EverybodyLeads])).await;
     if blind {
         w.shaky.be_blind();
     }
@@ -210,7 +210,7 @@ async fn comes_first_at_last(bugs: &[SeededBug]) -> bool {
     for n in 0..12 {
         w.submit_with(&format!("new-{n}"), "A", "B", |raw| raw.priority = Some(2)).await;
         w.pass(600).await;
-        let first = w.fleet.look(|view, _, _| view.queue.ready().next().cloned()).await;
+        let first = w.fleet.ask(|view, _, _| view.queue.ready().next().cloned()).await;
         let first = first.expect("an answer").expect("a task that is ready");
         if first.as_str() == "old" {
             return true;

@@ -40,7 +40,7 @@ impl AuditService {
             'rows: loop {
                 let rows = page(&*self.store, table, after).await?;
                 let Some(last) = rows.last() else { break };
-                after = Some(Cursor::of(last));
+                after = Some(Cursor::of_row(last));
                 for row in rows {
                     if row.index.order.is_some_and(|n| n.cast_unsigned() > head.n) {
                         break 'rows;

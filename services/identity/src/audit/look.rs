@@ -115,7 +115,7 @@ impl AuditService {
     pub(super) async fn list(&self, r: v1::ListAuditRequest) -> Result<v1::ListAuditResponse, Refusal> {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
-        let robot = if r.robot_id.is_empty() { None } else { bad.take("robot_id", RobotId::parse(&r.robot_id)) };
+        let robot = if r.robot_id.is_empty() { None } else { bad.accept("robot_id", RobotId::parse(&r.robot_id)) };
         let mut chains = chains(&r.service, &r.page_token, &mut bad);
         let since = parse_time(r.since.as_ref(), At::top("since"), &mut bad);
         let until = parse_time(r.until.as_ref(), At::top("until"), &mut bad);

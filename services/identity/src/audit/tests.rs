@@ -49,7 +49,7 @@ impl World {
         item.audit(note);
         assert!(self.service.store.commit(vec![item]).await.iter().all(Result::is_ok));
     }
-    async fn keep(&self, writer: Writer) {
+    async fn maintain(&self, writer: Writer) {
         upkeep::maintain_chain(&*self.service.store, &*self.wall, writer).await.unwrap_or_else(|e| panic!("{e}"));
     }
     /// All rows that fit, page by page, as `service:n`, and how many pages it took.
@@ -147,18 +147,18 @@ async fn each_chain_quotes_the_others_once_an_hour() {
     let world = World::new();
     world.note(Writer::Fleet, "anna", cordon("r1")).await;
     for _ in 0..3 {
-        world.keep(Writer::Task).await;
+        world.maintain(Writer::Task).await;
     }
     let anchors = world.rows(Writer::Task).await;
     assert_eq!(anchors.len(), 1, "once");
     assert_eq!(anchors[0].heads["fleet"], world.rows(Writer::Fleet).await[0].head());
     world.pass(limits::AUDIT_ANCHOR_EVERY_MS as i64 - 1);
-    world.keep(Writer::Task).await;
+    world.maintain(Writer::Task).await;
     assert_eq!(world.rows(Writer::Task).await.len(), 1);
     world.pass(1);
-    world.keep(Writer::Task).await;
+    world.maintain(Writer::Task).await;
     assert_eq!(world.rows(Writer::Task).await.len(), 2);
-    world.keep(Writer::Telemetry).await;
+    world.maintain(Writer::Telemetry).await;
 }
 
 #[tokio::test]
@@ -167,13 +167,13 @@ async fn rows_go_after_four_hundred_days_and_what_is_left_holds() {
     for n in 0..5 {
         world.note(Writer::Fleet, "anna", cordon(&format!("r{n}"))).await;
     }
-    world.keep(Writer::Task).await;
+    world.maintain(Writer::Task).await;
     world.pass(limits::AUDIT_DAYS as i64 * DAY_MS);
     world.note(Writer::Fleet, "anna", cordon("r9")).await;
-    world.keep(Writer::Fleet).await;
+    world.maintain(Writer::Fleet).await;
     assert_eq!(world.rows(Writer::Fleet).await.len(), 7, "a day that is not over is kept");
     world.pass(1);
-    world.keep(Writer::Fleet).await;
+    world.maintain(Writer::Fleet).await;
     let left: Vec<u64> = world.rows(Writer::Fleet).await.iter().map(|row| row.n).collect();
     assert_eq!(
         left,
@@ -197,7 +197,7 @@ async fn a_quote_of_a_row_that_went_before_it_was_old_shows_that_it_was_taken_aw
     for n in 0..3 {
         world.note(Writer::Fleet, "anna", cordon(&format!("r{n}"))).await;
     }
-    world.keep(Writer::Task).await;
+    world.maintain(Writer::Task).await;
     let head = world.rows(Writer::Fleet).await[2].head();
     world.note(Writer::Fleet, "fleet", Note::cut(head)).await;
     let verdicts = world.verify(Vec::new()).await;
@@ -213,7 +213,7 @@ async fn an_export_holds_by_itself_and_has_the_heads_that_verify_says() {
         world.note(Writer::Fleet, "anna", cordon(&format!("r{n}")).because("x".repeat(200))).await;
     }
     for writer in [Writer::Task, Writer::Fleet] {
-        world.keep(writer).await;
+        world.maintain(writer).await;
     }
     let lines = world.export().await;
     assert_eq!(lines.len(), 1 + 301 + 1 + 1);
@@ -223,7 +223,7 @@ async fn an_export_holds_by_itself_and_has_the_heads_that_verify_says() {
     let export = midshift_core::audit::Export::parse(&lines[0]).unwrap_or_else(|| panic!("an export"));
     let quoted: Vec<Mark> = lines[1..].iter().flat_map(|line| Mark::in_line(line)).collect();
     let mut held = Held::new(&export, &quoted, Utc(BEGIN));
-    lines[1..].iter().for_each(|line| held.take(line));
+    lines[1..].iter().for_each(|line| held.add_line(line));
     let offline = held.finish();
     let head = |verdict: &v1::AuditVerdict| verdict.head.clone().map(|h| Head { n: h.n, hash: h.hash });
     for verdict in world.verify(Vec::new()).await.iter().filter(|verdict| verdict.rows > 0) {

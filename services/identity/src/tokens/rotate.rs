@@ -37,7 +37,7 @@ impl Turn {
             bad.add("overlap_seconds", format!("must be at most {longest}: 7 days"));
         }
         let named = !r.request_id.is_empty();
-        let request_id = named.then(|| bad.take("request_id", RequestId::parse(&r.request_id))).flatten();
+        let request_id = named.then(|| bad.accept("request_id", RequestId::parse(&r.request_id))).flatten();
         bad.finish()?;
         Ok(Self { name: r.name.clone(), valid, overlap: LinkDuration::from_secs(r.overlap_seconds), request_id })
     }

@@ -197,7 +197,7 @@ async fn into_a_database_with_rows_nothing_is_restored() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn when_nobody_knows_whether_the_rows_came_folders_stay_and_people_are_told() {
     let used = Used::new(Table::Attempt, Writer::Fleet).await;
-    let copy = PostgresCopy::take(&used.config, used.dir.path()).await.expect("read").expect("a copy");
+    let copy = PostgresCopy::begin(&used.config, used.dir.path()).await.expect("read").expect("a copy");
     let server = PostgresServer::shared();
     let config = PostgresConfig::new(server.database_named("silent"));
     let rows = PostgresRestore::begin(&config, used.dir.path(), &copy, &StoreId::fresh()).await.expect("rows");

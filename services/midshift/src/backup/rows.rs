@@ -67,7 +67,7 @@ impl Part for Schemas {
     async fn copy(&self, from: &Places, folder: &Path, said: &mut Said) -> anyhow::Result<bool> {
         let Some(config) = &from.store else { return Ok(false) };
         fs::create_dir_all(folder)?;
-        let Some(copy) = PostgresCopy::take(config, folder).await? else {
+        let Some(copy) = PostgresCopy::begin(config, folder).await? else {
             bail!("no server ever served from this database")
         };
         write(&folder.join(COPIED), &serde_json::to_vec_pretty(&copy)?)?;

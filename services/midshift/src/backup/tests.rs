@@ -162,7 +162,7 @@ pub async fn release(dir: &Path, data: &Path, version: u64) -> std::path::PathBu
     raise_floor(&documents, version).expect("written");
     let (content, repository) = repository(data, &keys).await;
     let bytes = b"a file of a release".to_vec();
-    let file = Wanted { digest: Digest::of(&bytes), length: bytes.len() as u64 };
+    let file = Wanted { digest: Digest::of_content(&bytes), length: bytes.len() as u64 };
     let target = FileTarget { name: "walk".to_owned(), digest: file.digest, length: file.length };
     content.append(file, 0, bytes.into()).await.expect("room");
     assert_eq!(content.settle(file).await.expect("asked"), Held::Whole);

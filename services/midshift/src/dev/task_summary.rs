@@ -136,7 +136,7 @@ async fn read_rows(store: &dyn Store, tasks: &SharedTasks) -> Result<Seq, Error>
         for row in intakes.iter().chain(&store.get(states).await?) {
             fresh.apply_row(row)?;
         }
-        after = intakes.last().map(Cursor::of);
+        after = intakes.last().map(Cursor::of_row);
     }
     *tasks.lock().unwrap_or_else(PoisonError::into_inner) = fresh;
     Ok(alive.seq)

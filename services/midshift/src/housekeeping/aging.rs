@@ -131,7 +131,7 @@ impl World {
     async fn consume<R: Record>(&mut self, writer: Writer, mark: &R, at: usize) {
         let expect = if self.marked[at] == Revision(0) { Expect::Absent } else { Expect::At(self.marked[at]) };
         let mut item = Item::new(writer, "test");
-        item.put(mark, expect, "mark");
+        item.put_row(mark, expect, "mark");
         self.marked[at] = self.marked[at].next();
         self.commit(item).await;
     }

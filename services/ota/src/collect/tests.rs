@@ -59,7 +59,7 @@ impl Shop {
         self.content.settle(file).await
     }
     async fn has(&self, content: &[u8]) -> bool {
-        self.content.length(Digest::of(content)).await.expect("asked").is_some()
+        self.content.length(Digest::of_content(content)).await.expect("asked").is_some()
     }
     /// Publishes a document that lists the files of these bundles and no other.
     async fn publish(&self, bundles: &[&Bundle]) -> Result<(), crate::repository::Error> {
@@ -99,11 +99,11 @@ impl Shop {
 }
 
 fn wanted(content: &[u8]) -> Wanted {
-    Wanted { digest: Digest::of(content), length: content.len() as u64 }
+    Wanted { digest: Digest::of_content(content), length: content.len() as u64 }
 }
 
 fn id(manifest: &Manifest) -> BundleId {
-    BundleId::parse(&Digest::of(&manifest.to_bytes()).to_string()).expect("an id")
+    BundleId::parse(&Digest::of_content(&manifest.to_bytes()).to_string()).expect("an id")
 }
 
 /// A bundle with the files that it and others have.
@@ -114,7 +114,7 @@ fn with(version: &str, shared: &[(&str, &[u8])]) -> Bundle {
         let mut component = manifest.components[0].clone();
         component.name = (*name).to_owned();
         component.version = "1.0.0".to_owned();
-        (component.digest, component.length) = (Digest::of(bytes), bytes.len() as u64);
+        (component.digest, component.length) = (Digest::of_content(bytes), bytes.len() as u64);
         files.push((component.target(), bytes.to_vec()));
         manifest.components.push(component);
     }
@@ -216,7 +216,7 @@ async fn who_has_begun_to_read_reads_on() {
     let mut shop = Shop::new(1 << 20).await;
     let content = vec![9; 100_000];
     shop.bring(&content).await.expect("room");
-    let digest = Digest::of(&content);
+    let digest = Digest::of_content(&content);
     let mut handle = shop.content.read(digest, 0..100_000).await.expect("readable").expect("there");
     shop.after(1).await;
     assert_eq!(shop.after(TIME).await.file_bytes, 100_000);
@@ -259,7 +259,7 @@ async fn a_pass_that_was_cut_is_gone_on_with_and_marks_of_files_that_went_hurt_n
     }
     shop.after(1).await;
     // As a cut between the first file and the marks leaves it.
-    fs::remove_file(shop.dir.path().join("content").join(Digest::of(b"one").to_string())).expect("one went");
+    fs::remove_file(shop.dir.path().join("content").join(Digest::of_content(b"one").to_string())).expect("one went");
     let mut shop = shop.restarted().await;
     shop.bring(b"one").await.expect("brought anew at once");
     assert_eq!(shop.after(TIME).await.files, 1, "the other; who brings is there");
@@ -275,7 +275,7 @@ async fn when_nobody_can_tell_what_a_named_bundle_is_everything_stays() {
     shop.bring(b"stray").await.expect("room");
     shop.name(&[&old]);
     shop.after(1).await;
-    let manifest = Digest::of(&old.0.to_bytes());
+    let manifest = Digest::of_content(&old.0.to_bytes());
     fs::write(shop.dir.path().join("content").join(manifest.to_string()), "no manifest").expect("damaged");
     shop.named.served_ms += 2 * TIME;
     let error = shop.pass().await.expect_err("it cannot be read");
@@ -293,7 +293,8 @@ async fn a_robot_that_names_a_file_that_is_no_bundle_keeps_that_file_and_stops_n
     shop.bring(b"another").await.expect("room");
     // A component of the withdrawn release, of the newest one, and a file of no release.
     let component = &old.1[0].1;
-    let named = [component.as_slice(), new.1[0].1.as_slice(), b"stray"].map(|bytes| Digest::of(bytes).to_string());
+    let named =
+        [component.as_slice(), new.1[0].1.as_slice(), b"stray"].map(|bytes| Digest::of_content(bytes).to_string());
     shop.named.bundles = named.iter().map(|digest| BundleId::parse(digest).expect("an id")).collect();
     shop.after(1).await;
     assert_eq!(shop.after(TIME).await.files, 2, "the old manifest and the other file");
@@ -311,7 +312,7 @@ async fn a_file_that_the_disk_holds_on_to_stops_no_pass_and_goes_when_it_can() {
     }
     shop.after(1).await;
     // No file can be removed where a folder with something in it is.
-    let path = shop.dir.path().join("content").join(Digest::of(b"stuck").to_string());
+    let path = shop.dir.path().join("content").join(Digest::of_content(b"stuck").to_string());
     fs::remove_file(&path).expect("gone");
     fs::create_dir_all(path.join("in-the-way")).expect("a folder");
     let done = shop.after(TIME).await;

@@ -17,7 +17,7 @@ fn store(dir: &TempDir) -> DiskContent {
 }
 
 fn wanted(content: &[u8]) -> Wanted {
-    Wanted { digest: Digest::of(content), length: content.len() as u64 }
+    Wanted { digest: Digest::of_content(content), length: content.len() as u64 }
 }
 
 fn bytes(count: usize, seed: u8) -> Vec<u8> {
@@ -113,7 +113,7 @@ async fn wrong_bytes_are_thrown_away_and_the_right_ones_may_come() {
     let file = wanted(&content);
     store.append(file, 0, Bytes::from(bytes(500, 5))).await.expect("nobody knows yet");
     let error = store.settle(file).await.expect_err("others");
-    assert!(matches!(error, Error::WrongBytes { found } if found == Digest::of(&bytes(500, 5))), "{error}");
+    assert!(matches!(error, Error::WrongBytes { found } if found == Digest::of_content(&bytes(500, 5))), "{error}");
     assert_eq!(names(dir.path()), Vec::<String>::new());
     assert_eq!(bring(&store, &content).await.expect("whole"), Held::Whole);
 }
@@ -159,7 +159,7 @@ async fn the_quota_counts_whole_files_and_parts_over_restarts() {
     drop(first);
     let again = store(&dir);
     assert!(matches!(bring(&again, &other).await, Err(Error::Full { .. })));
-    let wrong = Wanted { digest: Digest::of(b"something else"), length: QUOTA / 2 };
+    let wrong = Wanted { digest: Digest::of_content(b"something else"), length: QUOTA / 2 };
     again.append(wrong, 0, Bytes::from(bytes(QUOTA as usize / 2, 11))).await.expect("it fits");
     assert!(matches!(bring(&again, b"x").await, Err(Error::Full { .. })), "parts count too");
     assert!(matches!(again.settle(wrong).await, Err(Error::WrongBytes { .. })));
@@ -170,14 +170,14 @@ async fn the_quota_counts_whole_files_and_parts_over_restarts() {
 async fn sizes_beyond_the_cap_and_bytes_beyond_the_whole_are_refused() {
     let dir = TempDir::new().expect("a folder");
     let store = DiskContent::open(dir.path(), Room::with_quota(u64::MAX)).expect("a store");
-    let digest = Digest::of(b"any");
+    let digest = Digest::of_content(b"any");
     for length in [0, COMPONENT_BYTES_MAX + 1, u64::MAX] {
         let error = store.append(Wanted { digest, length }, 0, Bytes::from_static(b"x")).await.expect_err("refused");
         assert!(matches!(error, Error::Size), "{length}: {error}");
     }
     let largest = Wanted { digest, length: COMPONENT_BYTES_MAX };
     store.append(largest, 0, Bytes::from_static(b"x")).await.expect("the largest");
-    let short = Wanted { digest: Digest::of(b"abc"), length: 3 };
+    let short = Wanted { digest: Digest::of_content(b"abc"), length: 3 };
     let error = store.append(short, 0, Bytes::from_static(b"abcd")).await.expect_err("one too many");
     assert!(matches!(error, Error::TooLong { length: 3, end: 4 }), "{error}");
 }
@@ -187,20 +187,20 @@ async fn ranges_are_cut_at_the_end_of_the_file() {
     let dir = TempDir::new().expect("a folder");
     let store = store(&dir);
     let content = bytes(1000, 12);
-    let digest = Digest::of(&content);
+    let digest = Digest::of_content(&content);
     bring(&store, &content).await.expect("whole");
     for range in [0..1000, 0..1, 999..1000, 400..600, 990..2000, 1000..1001, 5000..6000, 7..7] {
         let expected: Vec<u8> =
             content.iter().skip(range.start as usize).take((range.end - range.start) as usize).copied().collect();
         assert_eq!(read(&store, digest, range.clone()).await, expected, "{range:?}");
     }
-    assert!(store.read(Digest::of(b"nobody"), 0..1).await.expect("asked").is_none());
+    assert!(store.read(Digest::of_content(b"nobody"), 0..1).await.expect("asked").is_none());
 }
 
 #[tokio::test]
 async fn ranges_around_two_and_four_gib_are_where_they_should_be() {
     let dir = TempDir::new().expect("a folder");
-    let digest = Digest::of(b"a name for a sparse file");
+    let digest = Digest::of_content(b"a name for a sparse file");
     let file = fs::File::create(dir.path().join(digest.to_string())).expect("a file");
     for edge in [1_u64 << 31, 1 << 32] {
         std::os::unix::fs::FileExt::write_all_at(&file, b"edge", edge - 2).expect("sparse");
@@ -278,22 +278,22 @@ async fn a_file_that_is_taken_away_is_gone_over_a_restart_and_its_room_is_free()
     first.append(wanted(&half), 0, Bytes::copy_from_slice(&half[..300])).await.expect("a piece");
     first.settle(wanted(&half)).await.expect("durable");
     let listed: Vec<_> = first.list().await.expect("listed").iter().map(|s| (s.digest, s.bytes)).collect();
-    let mut expected = [(Digest::of(&whole), 1000), (Digest::of(&half), 300)];
+    let mut expected = [(Digest::of_content(&whole), 1000), (Digest::of_content(&half), 300)];
     expected.sort();
     assert_eq!(listed, expected);
-    assert_eq!(first.remove(Digest::of(b"nobody")).await.expect("asked"), 0);
-    assert_eq!(first.remove(Digest::of(&whole)).await.expect("removable"), 1000);
-    assert_eq!(first.remove(Digest::of(&half)).await.expect("removable"), 300);
+    assert_eq!(first.remove(Digest::of_content(b"nobody")).await.expect("asked"), 0);
+    assert_eq!(first.remove(Digest::of_content(&whole)).await.expect("removable"), 1000);
+    assert_eq!(first.remove(Digest::of_content(&half)).await.expect("removable"), 300);
     assert_eq!((first.fill().used_bytes, names(dir.path())), (0, Vec::new()));
     drop(first);
     let again = store(&dir);
     assert_eq!(again.list().await.expect("listed"), []);
     assert_eq!(bring(&again, &whole).await.expect("brought anew"), Held::Whole);
     // A cut between the name and the mark of a file leaves the mark.
-    fs::write(dir.path().join(format!("{}.mark", Digest::of(&whole))), "{\"length\":1000,\"durable\":1000}")
+    fs::write(dir.path().join(format!("{}.mark", Digest::of_content(&whole))), "{\"length\":1000,\"durable\":1000}")
         .expect("a mark");
     drop(again);
     let third = store(&dir);
-    assert_eq!(names(dir.path()), [Digest::of(&whole).to_string()]);
+    assert_eq!(names(dir.path()), [Digest::of_content(&whole).to_string()]);
     assert_eq!(third.fill().used_bytes, 1000);
 }

@@ -53,7 +53,7 @@ async fn bytes_are_given_to_machines_that_are_enrolled_and_to_no_other_with_a_ge
     release(&service, &files).await;
     let service = service.with_rows(rows().await);
     let (downloads, (name, content)) = (service.downloads(), &files[1]);
-    let digest = Digest::of(content).to_string();
+    let digest = Digest::of_content(content).to_string();
     let known = [machine("r1", 7), Caller::local()].map(|by| (by, None::<Code>, StatusCode::OK));
     let unknown = [machine("r1", 8), machine("r2", 7)];
     let unknown = unknown.map(|by| (by, Some(Code::RobotNotEnrolled), StatusCode::FORBIDDEN));

@@ -55,7 +55,7 @@ fn fields(status: &Status) -> Vec<String> {
 }
 
 fn pieces(content: &[u8], from: usize, size: usize) -> Vec<v1::UploadTargetRequest> {
-    let digest = Digest::of(content).to_string();
+    let digest = Digest::of_content(content).to_string();
     let piece = |(i, data): (usize, &[u8])| v1::UploadTargetRequest {
         digest: digest.clone(),
         length: content.len() as u64,
@@ -70,7 +70,8 @@ impl World {
         self.bundles.upload_target(tokio_stream::iter(pieces)).await.map(tonic::Response::into_inner)
     }
     async fn state(&mut self, content: &[u8]) -> v1::GetUploadResponse {
-        let request = v1::GetUploadRequest { digest: Digest::of(content).to_string(), length: content.len() as u64 };
+        let request =
+            v1::GetUploadRequest { digest: Digest::of_content(content).to_string(), length: content.len() as u64 };
         self.bundles.get_upload(request).await.expect("asked").into_inner()
     }
     async fn publish(
@@ -88,7 +89,7 @@ impl World {
         offset: u64,
         length: u64,
     ) -> Result<Vec<v1::FetchChunksResponse>, Status> {
-        let request = v1::FetchChunksRequest { digest: Digest::of(content).to_string(), offset, length };
+        let request = v1::FetchChunksRequest { digest: Digest::of_content(content).to_string(), offset, length };
         let mut stream = self.chunks.fetch_chunks(request).await?.into_inner();
         let mut all = Vec::new();
         while let Some(chunk) = stream.message().await? {
@@ -124,7 +125,7 @@ async fn a_release_is_brought_in_pieces_published_listed_and_fetched() {
     let listed = world.bundles.list_bundles(v1::ListBundlesRequest::default()).await.expect("listed").into_inner();
     let bundle = &listed.bundles[0];
     assert_eq!((bundle.name.as_str(), bundle.version.as_str(), bundle.length), ("walk", "1.0.0", 16));
-    assert_eq!(bundle.digest, Digest::of(&files[0].1).to_string());
+    assert_eq!(bundle.digest, Digest::of_content(&files[0].1).to_string());
     assert_eq!(
         (bundle.components[0].kind.as_str(), bundle.components[0].hardware.as_slice()),
         ("process", &["h1".to_owned()][..])
@@ -208,7 +209,7 @@ async fn pieces_that_are_too_large_or_in_the_wrong_place_are_refused() {
     let room = world.bundles.list_bundles(v1::ListBundlesRequest::default()).await.expect("listed").into_inner().room;
     assert_eq!(room, Some(v1::SoftwareRoom { used_bytes: used, quota_bytes: 1 << 30, ..Default::default() }));
     let mut wrong = pieces(b"bytes", 0, 5);
-    wrong[0].digest = Digest::of(b"other").to_string();
+    wrong[0].digest = Digest::of_content(b"other").to_string();
     assert_eq!(code(&world.upload(wrong).await.expect_err("wrong bytes")), Some(Code::UploadCorrupt));
 }
 
@@ -251,7 +252,7 @@ async fn a_server_without_keys_says_what_to_do() {
 #[tokio::test]
 async fn a_robot_is_told_of_the_patch_that_is_listed_for_it_and_another_of_the_whole_and_nothing_else_is_made() {
     let mut world = world().await;
-    let [old, new, other] = [b"old".as_slice(), b"new", b"other"].map(Digest::of);
+    let [old, new, other] = [b"old".as_slice(), b"new", b"other"].map(Digest::of_content);
     let named = |from| Way { to: new, from }.target();
     let patch = b"what the old one lacks".to_vec();
     let listed = [
@@ -289,10 +290,10 @@ async fn only_a_listed_file_has_ways_and_every_wrong_digest_is_told() {
     let mut ask = async |digest: String, base_digests: Vec<String>| {
         world.chunks.get_encoding(v1::GetEncodingRequest { digest, base_digests }).await.expect_err("refused")
     };
-    let unlisted = ask(Digest::of(b"of nobody").to_string(), Vec::new()).await;
+    let unlisted = ask(Digest::of_content(b"of nobody").to_string(), Vec::new()).await;
     assert_eq!(code(&unlisted), Some(Code::SoftwareNotFound));
     let wrong = ask("x".to_owned(), vec!["y".to_owned()]).await;
     assert_eq!(fields(&wrong), ["digest", "base_digests"]);
-    let many = ask(Digest::of(b"of nobody").to_string(), vec![Digest::of(b"x").to_string(); 9]).await;
+    let many = ask(Digest::of_content(b"of nobody").to_string(), vec![Digest::of_content(b"x").to_string(); 9]).await;
     assert_eq!(fields(&many), ["base_digests"]);
 }

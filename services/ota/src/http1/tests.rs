@@ -40,7 +40,7 @@ async fn world() -> (TempDir, OtaService, String, Vec<u8>) {
     let files = files("walk", "1.0.0");
     release(&service, &files).await;
     let (name, content) = files[1].clone();
-    let path = format!("/targets/{}.{name}", Digest::of(&content));
+    let path = format!("/targets/{}.{name}", Digest::of_content(&content));
     (dir, service, path, content)
 }
 
@@ -89,8 +89,8 @@ async fn a_client_with_the_beginning_of_another_file_gets_this_one_whole() {
 #[tokio::test]
 async fn only_what_a_release_lists_is_given_and_only_by_its_name() {
     let (_dir, service, path, content) = world().await;
-    let digest = Digest::of(&content);
-    let unlisted = format!("/targets/{}.other.component", Digest::of(b"other"));
+    let digest = Digest::of_content(&content);
+    let unlisted = format!("/targets/{}.other.component", Digest::of_content(b"other"));
     let renamed = format!("/targets/{digest}.other.component");
     for path in [&unlisted, &renamed, "/targets/walk", "/targets/..%2Fkeys%2Fsnapshot-1.pem", &path.to_uppercase()] {
         assert_eq!(ask(&service, "GET", path, &[]).await.code, StatusCode::NOT_FOUND, "{path}");

@@ -16,7 +16,7 @@ async fn world() -> (TempDir, OtaService, Vec<u8>, PathBuf) {
     let files = files("walk", "1.0.0");
     release(&service, &files).await;
     let content = files[1].1.clone();
-    let name = Digest::of(&content).to_string();
+    let name = Digest::of_content(&content).to_string();
     let path = find(dir.path().to_owned(), &name).expect("it lies there");
     (dir, service, content, path)
 }
@@ -35,7 +35,7 @@ fn find(folder: PathBuf, name: &str) -> Option<PathBuf> {
 async fn a_file_that_was_damaged_is_not_handed_out_and_can_be_brought_again() {
     let (_dir, service, content, path) = world().await;
     let opened = service.opened().expect("keys");
-    let file = Wanted { digest: Digest::of(&content), length: content.len() as u64 };
+    let file = Wanted { digest: Digest::of_content(&content), length: content.len() as u64 };
     std::fs::write(&path, vec![0; content.len()]).expect("damaged");
     let refusal = opened.downloads.listed(file.digest).await.expect_err("it is damaged");
     assert_eq!(refusal.reason.code, Code::SoftwareNotFound);
@@ -53,7 +53,7 @@ async fn a_file_that_was_damaged_is_not_handed_out_and_can_be_brought_again() {
 async fn a_file_is_hashed_the_first_time_and_once_a_day() {
     let (_dir, service, content, path) = world().await;
     let opened = service.opened().expect("keys");
-    let digest = Digest::of(&content);
+    let digest = Digest::of_content(&content);
     opened.downloads.listed(digest).await.expect("whole");
     std::fs::write(&path, vec![0; content.len()]).expect("damaged");
     opened.downloads.listed(digest).await.expect("it was hashed a moment ago");

@@ -26,14 +26,14 @@ pub fn roots(before: Option<&Kept>, offered: &[Vec<u8>], now: Utc) -> Result<Kep
     for (i, bytes) in offered.iter().enumerate() {
         let field = format!("roots[{i}]");
         check_size(&mut bad, &field, bytes);
-        let Some(edition) = bad.take(&field, root_edition(bytes)) else { break };
+        let Some(edition) = bad.accept(&field, root_edition(bytes)) else { break };
         let next = newest.as_ref().map_or(1, |root| root.edition.version + 1);
         if edition.version != next {
             bad.add(&field, format!("is root {}; the next is {next}", edition.version));
             break;
         }
         let signers = newest.as_ref().map_or(bytes, |root| &root.bytes);
-        bad.take(&field, check_root(signers, bytes));
+        bad.accept(&field, check_root(signers, bytes));
         newest = Some(Kept { bytes: bytes.clone(), edition });
     }
     if newest.is_none() && bad.0.is_empty() {
@@ -50,7 +50,7 @@ pub fn roots(before: Option<&Kept>, offered: &[Vec<u8>], now: Utc) -> Result<Kep
 pub fn targets(root: &Kept, before: Option<&Kept>, offered: Vec<u8>, now: Utc) -> Result<Kept, Error> {
     let mut bad = Violations::default();
     check_size(&mut bad, "targets", &offered);
-    bad.take("targets", check_targets(&root.bytes, &offered));
+    bad.accept("targets", check_targets(&root.bytes, &offered));
     let edition = targets_edition(&offered).ok();
     if let (Some(edition), Some(before)) = (edition, before)
         && edition.version != before.edition.version + 1
@@ -92,7 +92,7 @@ pub async fn releases(
     let mut releases = Vec::new();
     for file in files.iter().filter(|file| is_manifest(file)) {
         let field = format!("targets.{}", file.name);
-        let Some(manifest) = bad.take(&field, manifest(file, content).await?) else { continue };
+        let Some(manifest) = bad.accept(&field, manifest(file, content).await?) else { continue };
         for component in &manifest.components {
             let target = component.target();
             let found = by_name.get(target.as_str()).map(|file| (file.digest, file.length));
@@ -148,7 +148,7 @@ pub async fn key_sets(
     let mut bad = Violations::default();
     for (number, file) in new {
         let field = format!("targets.{}", file.name);
-        let Some((set, envelope)) = bad.take(&field, key_set(file, content).await?) else { break };
+        let Some((set, envelope)) = bad.accept(&field, key_set(file, content).await?) else { break };
         // Only robots know who signed the first one of a repository that is new here.
         let is_known = before.is_some() || last.is_some();
         let can_sign = |last: &&KeySet| before.is_none() || own.named_by(last).is_some();

@@ -356,7 +356,7 @@ async fn when_a_bundle_was_seen_is_forgotten_once_it_is_neither_listed_nor_here(
     room.repository.publish(Vec::new(), second.clone(), 1, Act::of_release(START)).await.expect("published");
     assert!(seen(), "its files are here still");
     for (_, content) in files("walk", "1.0.0") {
-        room.content.remove(Digest::of(&content)).await.expect("removed");
+        room.content.remove(Digest::of_content(&content)).await.expect("removed");
     }
     room.repository.publish(Vec::new(), without(&second, &[]), 2, Act::of_release(START)).await.expect("published");
     assert!(!seen());

@@ -119,10 +119,10 @@ fn selector(wire: &v1::RolloutSelector, bad: &mut Violations) -> Selector {
         ..Selector::default()
     };
     for (ix, id) in wire.robot_ids.iter().enumerate() {
-        selector.robots.extend(bad.take(&format!("spec.selector.robot_ids[{ix}]"), RobotId::parse(id)));
+        selector.robots.extend(bad.accept(&format!("spec.selector.robot_ids[{ix}]"), RobotId::parse(id)));
     }
     for (ix, id) in wire.area_ids.iter().enumerate() {
-        selector.areas.extend(bad.take(&format!("spec.selector.area_ids[{ix}]"), AreaId::parse(id)));
+        selector.areas.extend(bad.accept(&format!("spec.selector.area_ids[{ix}]"), AreaId::parse(id)));
     }
     selector
 }

@@ -50,7 +50,7 @@ fn required_reason(text: &str, bad: &mut Violations) {
 /// The client's request_id; none: no protection.
 fn request_id(text: &str, bad: &mut Violations) -> Option<String> {
     if !text.is_empty() {
-        bad.take("request_id", RequestId::parse(text));
+        bad.accept("request_id", RequestId::parse(text));
     }
     (!text.is_empty()).then(|| text.to_owned())
 }
@@ -86,7 +86,7 @@ struct RobotCall {
 impl RobotCall {
     fn read(robot_id: &str, client_request_id: &str, validate_only: bool) -> Self {
         let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(robot_id));
+        let robot_id = bad.accept("robot_id", RobotId::parse(robot_id));
         let request_id = request_id(client_request_id, &mut bad);
         Self { robot_id, request_id, check_only: check_only(validate_only), bad }
     }
@@ -114,7 +114,7 @@ impl RolloutService {
         request_id: Option<String>,
     ) -> Result<(v1::Rollout, Taken), Refusal> {
         let mut bad = Violations::default();
-        let rollout_id = bad.take("rollout_id", RolloutId::parse(about.rollout_id));
+        let rollout_id = bad.accept("rollout_id", RolloutId::parse(about.rollout_id));
         if about.reason.len() > limits::REASON_BYTES_MAX {
             bad.add("reason", "must be at most 256 bytes");
         }
@@ -157,7 +157,7 @@ impl RolloutService {
 
     async fn create(&self, r: v1::CreateRolloutRequest, by: &Caller) -> Result<v1::CreateRolloutResponse, Refusal> {
         let mut bad = Violations::default();
-        let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
+        let rollout_id = bad.accept("rollout_id", RolloutId::parse(&r.rollout_id));
         let spec = r.spec.unwrap_or_default();
         if spec.bundle.is_empty() {
             bad.add("spec.bundle", "is required");
@@ -175,7 +175,7 @@ impl RolloutService {
 
     async fn plan(&self, r: v1::PlanRolloutRequest, by: &Caller) -> Result<v1::PlanRolloutResponse, Refusal> {
         let mut bad = Violations::default();
-        let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
+        let rollout_id = bad.accept("rollout_id", RolloutId::parse(&r.rollout_id));
         bad.finish()?;
         let rollout_id = rollout_id.ok_or_else(internal)?;
         if let Some(spec) = &r.spec {
@@ -202,8 +202,8 @@ impl RolloutService {
 
     async fn exclude(&self, r: v1::ExcludeRobotRequest, by: &Caller) -> Result<v1::ExcludeRobotResponse, Refusal> {
         let mut bad = Violations::default();
-        bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        bad.accept("rollout_id", RolloutId::parse(&r.rollout_id));
+        let robot_id = bad.accept("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
         let about = About { by, rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
@@ -214,8 +214,8 @@ impl RolloutService {
 
     async fn write_off(&self, r: v1::WriteOffRobotRequest, by: &Caller) -> Result<v1::WriteOffRobotResponse, Refusal> {
         let mut bad = Violations::default();
-        bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        bad.accept("rollout_id", RolloutId::parse(&r.rollout_id));
+        let robot_id = bad.accept("robot_id", RobotId::parse(&r.robot_id));
         required_reason(&r.reason, &mut bad);
         let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
@@ -231,8 +231,8 @@ impl RolloutService {
         by: &Caller,
     ) -> Result<v1::RollBackRolloutResponse, Refusal> {
         let mut bad = Violations::default();
-        let of = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
-        let rollout_id = bad.take("new_rollout_id", RolloutId::parse(&r.new_rollout_id));
+        let of = bad.accept("rollout_id", RolloutId::parse(&r.rollout_id));
+        let rollout_id = bad.accept("new_rollout_id", RolloutId::parse(&r.new_rollout_id));
         bad.finish()?;
         let (of, rollout_id) = of.zip(rollout_id).ok_or_else(internal)?;
         self.act(Command::Rollback { of, rollout_id: rollout_id.clone() }, by, None).await?;
@@ -246,7 +246,7 @@ impl RolloutService {
     ) -> Result<v1::ListRolloutRobotsResponse, Refusal> {
         let mut bad = Violations::default();
         let size = pages::size(r.page_size, &mut bad);
-        let rollout_id = bad.take("rollout_id", RolloutId::parse(&r.rollout_id));
+        let rollout_id = bad.accept("rollout_id", RolloutId::parse(&r.rollout_id));
         bad.finish()?;
         let (rollout_id, by) = (rollout_id.ok_or_else(internal)?, by.clone());
         self.ask_about(vec![rollout_id.clone()], move |view, board, now| {
@@ -373,7 +373,7 @@ impl RolloutService {
 
     async fn lift(&self, r: v1::LiftQuarantineRequest, by: &Caller) -> Result<v1::LiftQuarantineResponse, Refusal> {
         let mut bad = Violations::default();
-        let robot_id = bad.take("robot_id", RobotId::parse(&r.robot_id));
+        let robot_id = bad.accept("robot_id", RobotId::parse(&r.robot_id));
         let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
         let robot_id = robot_id.ok_or_else(internal)?;
@@ -594,7 +594,7 @@ impl Face for RolloutService {
 
 fn named(rollout_id: &str) -> Result<RolloutId, Refusal> {
     let mut bad = Violations::default();
-    let rollout_id = bad.take("rollout_id", RolloutId::parse(rollout_id));
+    let rollout_id = bad.accept("rollout_id", RolloutId::parse(rollout_id));
     bad.finish()?;
     rollout_id.ok_or_else(internal)
 }

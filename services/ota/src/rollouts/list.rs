@@ -75,7 +75,7 @@ impl RolloutService {
         loop {
             let rows = self.store.list(query.clone()).await.map_err(unread)?;
             let is_last = rows.len() < query.limit.min(limits::PAGE_MAX);
-            query.after = rows.last().map(Cursor::of);
+            query.after = rows.last().map(Cursor::of_row);
             for row in rows {
                 let Some(rollout) = left_out.read::<Rollout>(&row).map_err(unread)? else { continue };
                 if !objects::sees(by, &rollout) {
@@ -84,7 +84,7 @@ impl RolloutService {
                 if found.len() == size {
                     return Ok((found, last.as_ref().map(token).unwrap_or_default()));
                 }
-                last = Some(Cursor::of(&row));
+                last = Some(Cursor::of_row(&row));
                 found.push(rollout);
             }
             if is_last {
@@ -105,7 +105,7 @@ impl RolloutService {
                 }
             }
             match rows.last() {
-                Some(last) if rows.len() == query.limit => query.after = Some(Cursor::of(last)),
+                Some(last) if rows.len() == query.limit => query.after = Some(Cursor::of_row(last)),
                 _ => return Ok(counts),
             }
         }

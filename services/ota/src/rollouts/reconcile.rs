@@ -281,7 +281,7 @@ impl Loop {
 
     /// Takes what robots said since.
     fn take_heartbeats(&mut self) {
-        for (robot_id, live) in self.dirty.take() {
+        for (robot_id, live) in self.dirty.take_changed() {
             match live {
                 Some(live) => {
                     self.heard.insert(robot_id.clone());

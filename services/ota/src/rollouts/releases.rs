@@ -60,7 +60,7 @@ pub fn take_release(view: &mut RolloutProjection, now: Now, newest: Option<&Newe
                 let note = unlisted.iter().fold(note, |note, bundle| note.about("bundle", bundle));
                 tx.audit(if unlisted.is_empty() { note } else { note.with("unlisted", unlisted.join(" ")) });
                 for row in rows {
-                    tx.put(row.clone(), if row.listed { "bundle.listed" } else { "bundle.unlisted" });
+                    tx.put_row(row.clone(), if row.listed { "bundle.listed" } else { "bundle.unlisted" });
                 }
             });
         }

@@ -93,7 +93,7 @@ fn opened(service: &OtaService) -> &Opened {
 }
 
 fn wanted(content: &[u8]) -> Wanted {
-    Wanted { digest: Digest::of(content), length: content.len() as u64 }
+    Wanted { digest: Digest::of_content(content), length: content.len() as u64 }
 }
 
 async fn append(service: &OtaService, content: &[u8], range: std::ops::Range<usize>) -> Result<(), Error> {
@@ -111,7 +111,7 @@ async fn bring(service: &OtaService, content: &[u8]) {
 }
 
 async fn has(service: &OtaService, content: &[u8]) -> bool {
-    opened(service).content.length(Digest::of(content)).await.expect("asked").is_some()
+    opened(service).content.length(Digest::of_content(content)).await.expect("asked").is_some()
 }
 
 /// Brings files and publishes a document that lists them too.
@@ -175,10 +175,10 @@ async fn what_was_cut_between_two_steps_of_an_upload_is_mended_by_the_next_turn(
     let site = Site::new();
     let two = site.process().await;
     let (content, files) = (noise(3, 1000), site.folder().join("content"));
-    let digest = Digest::of(&content);
+    let digest = Digest::of_content(&content);
     // A part without its word, and a word without its part.
     fs::write(files.join(format!("{digest}.part")), b"xyz").expect("written");
-    fs::write(files.join(format!("{}.mark", Digest::of(b"x"))), b"{}").expect("written");
+    fs::write(files.join(format!("{}.mark", Digest::of_content(b"x"))), b"{}").expect("written");
     assert_eq!(settle(&two, &content).await, Held::Part(0));
     bring(&two, &content).await;
     // Named, and the word still there.
@@ -196,7 +196,7 @@ async fn after_a_loss_of_power_the_first_process_believes_only_what_was_durable(
     append(&one, &content, 0..400).await.expect("a piece");
     assert_eq!(settle(&one, &content).await, Held::Part(400));
     drop(one);
-    let part = site.folder().join("content").join(format!("{}.part", Digest::of(&content)));
+    let part = site.folder().join("content").join(format!("{}.part", Digest::of_content(&content)));
     let mut torn = fs::read(&part).expect("the part");
     torn.extend([0; 300]);
     fs::write(&part, torn).expect("what no process wrote");
@@ -361,7 +361,7 @@ async fn a_file_that_is_brought_again_through_the_other_process_has_its_time_ane
     let (one, two) = (site.process().await, site.process().await);
     let stray = noise(10, 500);
     bring(&two, &stray).await;
-    let path = site.folder().join("content").join(Digest::of(&stray).to_string());
+    let path = site.folder().join("content").join(Digest::of_content(&stray).to_string());
     // So that a tick of the file system is not what the test is about.
     File::open(&path).and_then(|file| file.set_modified(SystemTime::UNIX_EPOCH)).expect("an old file");
     pass(&one, 0).await;
@@ -429,7 +429,7 @@ async fn a_gateway_hands_out_what_others_publish_and_writes_nothing() {
     let one = site.process().await;
     let reader = site.reader().await;
     let walk = files("walk", "1.0.0");
-    let (digest, content) = (Digest::of(&walk[1].1), walk[1].1.clone());
+    let (digest, content) = (Digest::of_content(&walk[1].1), walk[1].1.clone());
     for (_, content) in &walk {
         bring(&one, content).await;
     }
@@ -465,7 +465,7 @@ async fn what_is_withdrawn_by_others_is_handed_out_no_more_once_the_gateway_foll
     let document = midshift_bundle::repository::sign_targets(Some(&first), &[], &names, ends, &[&key]).expect("signed");
     opened(&one).repository.publish(Vec::new(), document, 1, Act::of_release(START)).await.expect("withdrawn");
     reader.documents.follow().await.expect("readable");
-    let refused = fetched(&reader.downloads, Digest::of(&walk[1].1), 1).await.expect_err("withdrawn");
+    let refused = fetched(&reader.downloads, Digest::of_content(&walk[1].1), 1).await.expect_err("withdrawn");
     assert_eq!(refused.code(), Code::NotFound);
 }
 
@@ -473,7 +473,7 @@ async fn what_is_withdrawn_by_others_is_handed_out_no_more_once_the_gateway_foll
 async fn a_gateway_tells_robots_of_the_patches_that_are_listed() {
     let site = Site::new();
     let one = site.process().await;
-    let [base, target] = [b"old".as_slice(), b"new"].map(Digest::of);
+    let [base, target] = [b"old".as_slice(), b"new"].map(Digest::of_content);
     let patch = (Way { to: target, from: Some(base) }.target(), b"what it lacks".to_vec());
     let release = [("gait-2.component".to_owned(), b"new".to_vec()), patch.clone()];
     publish(&one, None, &release, 0).await.expect("published");

@@ -52,7 +52,7 @@ async fn verify(store: &dyn Store, writer: Writer) -> Result<Verified, Broken> {
     loop {
         let page = store.list(Query { after, limit: 100, ..Query::all(table) }).await.unwrap();
         let Some(last) = page.last() else { return chain.finish() };
-        after = Some(Cursor::of(last));
+        after = Some(Cursor::of_row(last));
         for row in &page {
             chain.take_row(row)?;
         }

@@ -181,7 +181,7 @@ async fn a_kept_row_guards_and_stays_as_it_is(store: Arc<dyn Store>) {
     one(&*store, Writer::Telemetry, vec![put(Table::Presence, "r1", Expect::Absent, "{}")]).await.unwrap();
     let presence = Key::new(Table::Presence, "r1");
     let mut relying = item(Writer::Fleet, vec![put(Table::RobotAuthority, "r1", Expect::Absent, "{}")]);
-    relying.keep(presence.clone(), at(2));
+    relying.keep_row(presence.clone(), at(2));
     assert!(store.commit(vec![relying.clone()]).await[0].is_err(), "the guard does not hold");
     relying.rows[1].expect = at(1);
     let applied = store.commit(vec![relying]).await.remove(0).unwrap();
@@ -231,7 +231,7 @@ async fn a_list_pages_through_every_row_once_in_both_directions(store: Arc<dyn S
             let query = Query { after, limit: 2, newest_first, ..Query::all(Table::Incident) };
             let page = store.list(query).await.unwrap();
             let Some(last) = page.last() else { break };
-            after = Some(Cursor::of(last));
+            after = Some(Cursor::of_row(last));
             seen.extend(page.iter().map(|row| row.key.id.to_string()));
         }
         assert_eq!(seen, expected);
@@ -346,7 +346,7 @@ async fn a_prefix_lists_by_id_the_rows_that_begin_with_it(store: Arc<dyn Store>)
         loop {
             let page = store.list(Query { after, limit: 4, newest_first, ..of("T-") }).await.unwrap();
             let Some(last) = page.last() else { break };
-            after = Some(Cursor::of(last));
+            after = Some(Cursor::of_row(last));
             seen.extend(page.iter().map(|row| row.key.id.to_string()));
         }
         assert_eq!(seen, expected);
@@ -364,7 +364,7 @@ async fn a_submit_between_snapshot_and_commit_does_not_spoil_the_plan(store: Arc
     store.commit(vec![submit("t2")]).await.remove(0).unwrap();
     let state = snapshot.rows.iter().find(|row| row.key.table == Table::TaskState).unwrap();
     let mut plan = item(Writer::Fleet, vec![put(Table::TaskState, "t1", Expect::At(state.revision), "{}")]);
-    plan.keep(Key::new(Table::TaskIntake, "t1"), at(1));
+    plan.keep_row(Key::new(Table::TaskIntake, "t1"), at(1));
     assert!(store.commit(vec![plan]).await[0].is_ok());
 }
 

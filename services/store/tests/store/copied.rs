@@ -22,7 +22,7 @@ pub fn fresh() -> PostgresConfig {
 
 pub async fn taken(config: &PostgresConfig) -> (TempDir, PostgresCopy) {
     let dir = tempfile::tempdir().unwrap();
-    let copy = PostgresCopy::take(config, dir.path()).await.unwrap().expect("a store");
+    let copy = PostgresCopy::begin(config, dir.path()).await.unwrap().expect("a store");
     (dir, copy)
 }
 
@@ -84,7 +84,7 @@ pub async fn used() -> PostgresConfig {
         .await
         .unwrap();
     let heard = Heard { robot_id: robot(), session_epoch: 1, hb: 2, body: Arc::from("{}") };
-    PostgresHeard::open(&config, site()).await.unwrap().keep(vec![heard]).await.unwrap();
+    PostgresHeard::open(&config, site()).await.unwrap().append(vec![heard]).await.unwrap();
     config
 }
 
@@ -113,7 +113,7 @@ async fn a_database_made_of_a_copy_has_the_same_rows_and_goes_on_above_them_as_a
     assert_eq!(positions, [first, first + 1]);
     let heard = PostgresHeard::open(&to, site()).await.unwrap();
     let position = heard.position().await.unwrap();
-    heard.keep(vec![Heard { robot_id: robot(), session_epoch: 1, hb: 3, body: Arc::from("{}") }]).await.unwrap();
+    heard.append(vec![Heard { robot_id: robot(), session_epoch: 1, hb: 3, body: Arc::from("{}") }]).await.unwrap();
     assert_eq!((position, heard.position().await.unwrap()), (1, 2));
 }
 
@@ -214,7 +214,7 @@ async fn an_older_copy_is_brought_up_and_a_newer_one_is_refused() {
 async fn a_database_that_no_server_ever_served_from_has_no_copy() {
     let dir = tempfile::tempdir().unwrap();
     for config in [fresh(), database().await] {
-        assert_eq!(PostgresCopy::take(&config, dir.path()).await.unwrap(), None);
+        assert_eq!(PostgresCopy::begin(&config, dir.path()).await.unwrap(), None);
     }
 }
 

@@ -173,7 +173,7 @@ async fn a_table_that_the_user_may_not_read_whole_is_named_and_not_left_out() {
     for (sql, named) in steps {
         say(&mut owner, &sql.replace("{}", &format!("reader_of_{name}"))).await;
         let dir = tempfile::tempdir().unwrap();
-        let taken = PostgresCopy::take(&reader, dir.path()).await;
+        let taken = PostgresCopy::begin(&reader, dir.path()).await;
         match named {
             Some(named) => {
                 let refused = taken.expect_err(sql);
@@ -195,7 +195,7 @@ async fn a_database_with_one_of_the_schemas_is_refused_and_so_is_a_copy_without_
     for sql in ["DELETE FROM telemetry.schema_version WHERE version > 0", "DROP SCHEMA telemetry CASCADE"] {
         say(&mut stranger(&config).await, sql).await;
         let dir = tempfile::tempdir().unwrap();
-        let refused = PostgresCopy::take(&config, dir.path()).await.expect_err(sql);
+        let refused = PostgresCopy::begin(&config, dir.path()).await.expect_err(sql);
         assert!(matches!(refused, OpenError::NoSchema { schema: "telemetry" }), "{sql}: {refused:?}");
     }
 }

@@ -133,7 +133,7 @@ async fn a_kept_row_guards_against_another_process() {
     let mut other = stranger(&config).await;
     say(&mut other, &format!("{LOCK_HEAD}; UPDATE presence SET revision = 2 WHERE id = 'r1'")).await;
     let mut relying = item(Writer::Fleet, vec![put(Table::RobotAuthority, "r1", Expect::Absent, "{}")]);
-    relying.keep(Key::new(Table::Presence, "r1"), at(1));
+    relying.keep_row(Key::new(Table::Presence, "r1"), at(1));
     let writer = store.clone();
     let waiting = tokio::spawn(async move { writer.commit(vec![relying]).await.remove(0) });
     until_a_writer_waits(&mut stranger(&config).await).await;

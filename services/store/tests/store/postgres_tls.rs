@@ -112,7 +112,7 @@ async fn everything_of_a_store_goes_over_tls_1_3_when_both_sides_prove_themselve
     assert!(count("") >= 5, "writers, readers and who listens");
     let others = format!("SELECT count(*) {of_ours} AND version IS DISTINCT FROM 'TLSv1.3'");
     assert_eq!(server.ask(&near, &others), "0", "connections without it");
-    assert!(PostgresCopy::take(&config, files.0.path()).await.unwrap().is_some(), "a backup goes the same way");
+    assert!(PostgresCopy::begin(&config, files.0.path()).await.unwrap().is_some(), "a backup goes the same way");
 }
 
 #[tokio::test]

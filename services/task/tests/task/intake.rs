@@ -54,7 +54,7 @@ async fn sent_twice(bugs: Bugs) -> usize {
 #[tokio::test]
 async fn a_request_that_is_sent_again_is_the_same_task_and_without_its_key_it_is_another_one() {
     assert_eq!(sent_twice(Bugs::default()).await, 1);
-    assert_eq!(sent_twice(Bugs::of(&[SeededBug::ForgetsRequests])).await, 2);
+    assert_eq!(sent_twice(Bugs::seeded(&[SeededBug::ForgetsRequests])).await, 2);
 }
 
 #[tokio::test]

@@ -54,9 +54,9 @@ impl Old {
     /// What `filter` finds, and how many rows the store handed out for it.
     async fn page(&self, filter: TaskFilter, size: u32, token: &str) -> (v1::ListTasksResponse, usize) {
         let request = ListTasksRequest { filter: Some(filter), page_size: size, page_token: token.to_owned() };
-        self.counted.take();
+        self.counted.take_count();
         let page = self.service.list_tasks(local(request)).await.expect("a page").into_inner();
-        (page, self.counted.take())
+        (page, self.counted.take_count())
     }
 }
 
@@ -135,25 +135,25 @@ async fn a_page_says_more_only_if_there_is_a_task_more_or_it_says_how_far_it_loo
 async fn a_watch_of_one_task_reads_that_one() {
     let old = Old::site().await;
     let filter = TaskFilter { task_ids: vec![old.first.clone()], ..TaskFilter::default() };
-    old.counted.take();
+    old.counted.take_count();
     let request = v1::WatchTasksRequest { filter: Some(filter), cursor: String::new() };
     let stream = old.service.watch_tasks(local(request)).await.expect("a watch").into_inner();
     let mut watch = Watch::over(stream);
     let existing = watch.message().await;
     assert!(matches!(existing.item, Some(v1::watch_tasks_response::Item::Existing(task)) if task.task_id == old.first));
     watch.bookmark().await;
-    let rows = old.counted.take();
+    let rows = old.counted.take_count();
     assert!(rows <= 8, "{rows} rows");
 }
 
 #[tokio::test]
 async fn a_task_is_shown_whatever_came_after_it() {
     let old = Old::site().await;
-    old.counted.take();
+    old.counted.take_count();
     let request = local(v1::GetTaskRequest { task_id: old.first.clone() });
     let task = old.service.get_task(request).await.expect("a task").into_inner().task.expect("always set");
     assert_eq!(task.task_id, old.first);
-    let rows = old.counted.take();
+    let rows = old.counted.take_count();
     assert!(rows <= 3, "{rows} rows");
 }
 
@@ -161,7 +161,7 @@ async fn a_task_is_shown_whatever_came_after_it() {
 async fn a_watch_without_a_filter_begins_with_what_is_alive_and_reads_nothing_else() {
     let old = Old::site().await;
     let first = async |filter: Option<TaskFilter>| {
-        old.counted.take();
+        old.counted.take_count();
         let request = v1::WatchTasksRequest { filter, cursor: String::new() };
         let stream = old.service.watch_tasks(local(request)).await.expect("a watch").into_inner();
         let mut watch = Watch::over(stream);
@@ -169,7 +169,7 @@ async fn a_watch_without_a_filter_begins_with_what_is_alive_and_reads_nothing_el
         while let Some(v1::watch_tasks_response::Item::Existing(task)) = watch.message().await.item {
             told.push(task.task_id);
         }
-        (told, old.counted.take())
+        (told, old.counted.take_count())
     };
     let (told, rows) = first(None).await;
     assert_eq!(told, [old.first.as_str()], "the only one that is alive");

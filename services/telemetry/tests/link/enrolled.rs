@@ -28,7 +28,7 @@ fn enrolled(key: u8, at: i64) -> Result<RobotIdentity> {
 async fn write(world: &World, robot: &RobotIdentity) -> Result<()> {
     let known = load::<RobotIdentity>(world.store.as_ref(), "r1").await?;
     let mut item = Item::new(Writer::Identity, "anna");
-    item.put(robot, known.map_or(Expect::Absent, |(_, at)| Expect::At(at)), "robot.changed");
+    item.put_row(robot, known.map_or(Expect::Absent, |(_, at)| Expect::At(at)), "robot.changed");
     assert!(world.store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
     Ok(())
 }

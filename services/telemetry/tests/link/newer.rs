@@ -54,7 +54,7 @@ async fn goes_on() -> Result<()> {
     copied(&world, &fourth, Expect::Absent).await;
     assert_eq!(hears(&mut robot).await?, StopFacts { stops: vec![fourth.stop], resets: vec![] });
     let mut item = Item::new(Writer::Fleet, "fleet");
-    item.put(&work(&first), Expect::Absent, "work.desired");
+    item.put_row(&work(&first), Expect::Absent, "work.desired");
     assert!(world.store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
     assert_eq!(robot.hears(|down| down.work.clone()).await?, work(&first));
     // The other one is served, and is told nothing of the work that nobody here can read.

@@ -52,7 +52,7 @@ async fn a_copied_key_with_the_secret_beside_it_is_observed_and_told_of_once_whi
     // What is desired of the robot goes to the original alone.
     let policy = DesiredPolicy { robot_id: "r1".parse()?, generation: 7, areas: Vec::new() };
     let mut item = Item::new(Writer::Fleet, "fleet");
-    item.put(&policy, Expect::Absent, "policy.desired");
+    item.put_row(&policy, Expect::Absent, "policy.desired");
     assert!(world.store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
     assert_eq!(robot.hears(|down| down.policy.clone()).await?, policy);
     drop(robot);

@@ -52,7 +52,7 @@ async fn lost_on_the_way(bugs: Bugs) -> Result<(u64, Option<u64>)> {
 #[tokio::test(start_paused = true)]
 async fn events_that_were_lost_on_the_way_are_missed_and_a_rule_that_takes_holes_acknowledges_them() -> Result<()> {
     assert_eq!(lost_on_the_way(Bugs::default()).await?.1, Some(3));
-    assert_eq!(lost_on_the_way(Bugs::of(&[SeededBug::HolesAreTaken])).await?, (5, None));
+    assert_eq!(lost_on_the_way(Bugs::seeded(&[SeededBug::HolesAreTaken])).await?, (5, None));
     Ok(())
 }
 
@@ -98,7 +98,7 @@ async fn a_heartbeat_is_echoed_and_new_desired_work_is_pushed() -> Result<()> {
         load_word: None,
     };
     let mut item = Item::new(Writer::Fleet, "fleet");
-    item.put(&work, Expect::Absent, "work.desired");
+    item.put_row(&work, Expect::Absent, "work.desired");
     assert!(world.store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
     assert_eq!(robot.hears(|down| down.work.clone()).await?, work);
     Ok(())
@@ -129,7 +129,7 @@ async fn a_robot_whose_message_is_too_large_hears_so_before_its_session_ends() -
 
 #[tokio::test(start_paused = true)]
 async fn without_the_fence_a_clone_takes_over_a_robot_that_is_heard() -> Result<()> {
-    let world = world_with(Otherwise { bugs: Bugs::of(&[SeededBug::NoCloneFence]), frames: None }).await?;
+    let world = world_with(Otherwise { bugs: Bugs::seeded(&[SeededBug::NoCloneFence]), frames: None }).await?;
     let mut first = Robot::attach(&world, None).await?;
     first.beat().await?;
     let clone = Robot::attach(&world, None).await?;

@@ -107,6 +107,6 @@ async fn acked_without_a_disk(bugs: Bugs) -> Result<bool> {
 #[tokio::test(start_paused = true)]
 async fn status_is_acknowledged_once_it_is_written_and_a_rule_that_does_so_on_arrival_would_lose_it() -> Result<()> {
     assert!(!acked_without_a_disk(Bugs::default()).await?);
-    assert!(acked_without_a_disk(Bugs::of(&[SeededBug::StatusAckBeforeWrite])).await?);
+    assert!(acked_without_a_disk(Bugs::seeded(&[SeededBug::StatusAckBeforeWrite])).await?);
     Ok(())
 }

@@ -17,7 +17,7 @@ pub fn record(n: u8, scope: Scope) -> Result<StopRecord> {
 
 pub async fn copied(world: &World, record: &StopRecord, expect: Expect) {
     let mut item = Item::new(Writer::Stop, "stop");
-    item.put(record, expect, "stop.engaged");
+    item.put_row(record, expect, "stop.engaged");
     assert!(world.store.commit(vec![item]).await.iter().all(|applied| applied.is_ok()));
 }
 

@@ -298,10 +298,10 @@ impl Parties {
         }
         if robot.stage != Stage::Begun {
             (1..4).for_each(|s| stop.answered(LinkTime(s * 1_000)));
-            stop.look(&now(HEARD_MS, robot.silences), None, self.patience(at));
+            stop.advance(&now(HEARD_MS, robot.silences), None, self.patience(at));
         }
         if robot.stage == Stage::Silent {
-            stop.look(&now(SILENT_MS, robot.silences), None, self.patience(at));
+            stop.advance(&now(SILENT_MS, robot.silences), None, self.patience(at));
             // A silence that goes on after its resume has its name already.
             if robot.known.awaiting & silence == 0 {
                 stop.resumed(&self.ids(at, silence));
@@ -319,7 +319,7 @@ impl Parties {
             (_, Stage::Silent) => SILENT_MS,
             _ => HEARD_MS,
         };
-        let obeyed = stop.look(&now(ms, robot.silences), None, self.patience(at));
+        let obeyed = stop.advance(&now(ms, robot.silences), None, self.patience(at));
         let awaiting = names(stop.kept().awaiting.iter());
         robot.known = Known { facts: facts_of(&stop.kept().latch), awaiting };
         (robot.told, robot.stage) = (stop.is_told(), stage);
@@ -463,7 +463,7 @@ impl Parties {
                 let line = robot.line.as_mut().expect("it is open");
                 line.synced = true;
                 let whole = line.whole;
-                self.hear(at, robot, whole);
+                self.hear_news(at, robot, whole);
                 self.happens(at, robot, robot.stage, |stop| {
                     stop.told_all(Latch::default());
                 });
@@ -506,10 +506,10 @@ impl Parties {
     fn comes(&self, at: usize, robot: &mut Robot, news: Facts) {
         let line = robot.line.as_mut().expect("it is open");
         line.came = line.came.join(news);
-        self.hear(at, robot, news);
+        self.hear_news(at, robot, news);
     }
 
-    fn hear(&self, at: usize, robot: &mut Robot, news: Facts) {
+    fn hear_news(&self, at: usize, robot: &mut Robot, news: Facts) {
         robot.heard = robot.heard.join(news);
         let stops = numbers(news.engaged).map(|n| self.stop_of(n)).collect();
         let resets = self.resets(robot.known.facts, news.reset);
@@ -525,17 +525,17 @@ impl Parties {
     /// The service counts stops at once and tells all lines.
     fn engage(&self, next: &mut State, stops: Names) {
         next.service = self.merged(next.service, Facts { engaged: stops, reset: 0 });
-        self.tell(next, Facts { engaged: stops, reset: 0 });
+        self.tell_news(next, Facts { engaged: stops, reset: 0 });
     }
 
     /// Resets count when the file had its turn with them.
     fn settle(&self, next: &mut State) {
         let resets = Facts { engaged: 0, reset: std::mem::take(&mut next.pending) };
         next.service = self.merged(next.service, resets);
-        self.tell(next, resets);
+        self.tell_news(next, resets);
     }
 
-    fn tell(&self, next: &mut State, news: Facts) {
+    fn tell_news(&self, next: &mut State, news: Facts) {
         let lines = next.robots.iter_mut().filter_map(|robot| robot.line.as_mut());
         lines.for_each(|line| line.said = line.said.join(news));
     }

@@ -233,7 +233,7 @@ impl World {
         let marked =
             midshift_store::load::<LaneMark>(&*self.store, &format!("{id}/{}", mark.ring)).await.expect("a mark");
         let mut item = Item::new(Writer::Telemetry, id);
-        item.put(&session, known.map_or(Expect::Absent, Expect::At), "session.opened");
+        item.put_row(&session, known.map_or(Expect::Absent, Expect::At), "session.opened");
         if marked.is_none() {
             item.create(&mark, "lane.marked");
         }
@@ -267,7 +267,7 @@ impl World {
     pub fn beat(&mut self, id: &str) {
         let now = self.clock.now();
         let live = self.r(id).heartbeat(&now);
-        self.board.put(&RobotId::parse(id).expect("an id"), Arc::new(live));
+        self.board.publish(&RobotId::parse(id).expect("an id"), Arc::new(live));
     }
 
     /// Telemetry stores what the robot has written and not yet delivered.
@@ -361,7 +361,7 @@ impl World {
     pub async fn stop(&self, record: &StopRecord) {
         let known = midshift_store::load::<StopRecord>(&*self.store, &record.id()).await.expect("a store");
         let mut item = Item::new(Writer::Stop, "tests");
-        item.put(record, known.map_or(Expect::Absent, |(_, revision)| Expect::At(revision)), "stop.copied");
+        item.put_row(record, known.map_or(Expect::Absent, |(_, revision)| Expect::At(revision)), "stop.copied");
         self.commit(item).await;
     }
 

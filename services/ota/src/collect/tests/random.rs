@@ -28,7 +28,7 @@ fn line() -> Vec<Bundle> {
 }
 
 fn files<'a>(bundles: impl IntoIterator<Item = &'a Bundle>) -> BTreeSet<Digest> {
-    bundles.into_iter().flat_map(|(_, files)| files.iter()).map(|(_, content)| Digest::of(content)).collect()
+    bundles.into_iter().flat_map(|(_, files)| files.iter()).map(|(_, content)| Digest::of_content(content)).collect()
 }
 
 struct Run<'a> {
@@ -119,7 +119,7 @@ impl<'a> Run<'a> {
             let reader = self.shop.content.read(digest, 0..u64::MAX).await.expect("readable");
             let mut bytes = Vec::new();
             reader.expect("it is needed").read_to_end(&mut bytes).await.expect("its bytes");
-            assert_eq!(Digest::of(&bytes), digest);
+            assert_eq!(Digest::of_content(&bytes), digest);
         }
         let used = self.shop.content.fill().used_bytes;
         assert!(used <= QUOTA, "{used}");

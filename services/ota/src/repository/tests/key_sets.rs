@@ -101,7 +101,7 @@ async fn a_server_without_a_key_of_the_newest_set_signs_nothing_until_the_key_is
 async fn a_server_that_cannot_read_the_newest_set_signs_nothing_until_it_can() {
     let (room, first) = published().await;
     let set = key_set(1, &[15, 5], 5);
-    let path = room.dir.path().join("content").join(Digest::of(&set.1).to_string());
+    let path = room.dir.path().join("content").join(Digest::of_content(&set.1).to_string());
     push(&room, &first, 1, &[set]).await.expect("published");
     hide(&path);
     let room = room.restarted().await;
@@ -131,7 +131,7 @@ async fn a_server_whose_newest_set_is_gone_or_damaged_says_which_and_signs_again
     for damaged in [None, Some(&b"not a set"[..])] {
         let (room, first) = published().await;
         let set = key_set(1, &[15, 5], 5);
-        let path = room.dir.path().join("content").join(Digest::of(&set.1).to_string());
+        let path = room.dir.path().join("content").join(Digest::of_content(&set.1).to_string());
         push(&room, &first, 1, std::slice::from_ref(&set)).await.expect("published");
         match damaged {
             None => fs::remove_file(&path).expect("removed"),
@@ -158,7 +158,7 @@ async fn a_server_whose_newest_set_is_gone_or_damaged_says_which_and_signs_again
 async fn a_set_that_goes_while_it_is_known_is_known_still() {
     let (room, first) = published().await;
     let set = key_set(1, &[15, 5], 5);
-    let path = room.dir.path().join("content").join(Digest::of(&set.1).to_string());
+    let path = room.dir.path().join("content").join(Digest::of_content(&set.1).to_string());
     push(&room, &first, 1, &[set]).await.expect("published");
     let other = Documents::reading(&room.metadata(), room.content.clone()).await.expect("readable");
     fs::remove_file(&path).expect("removed");

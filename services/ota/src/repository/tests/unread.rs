@@ -11,7 +11,7 @@ use std::sync::Arc;
 type File = (String, Vec<u8>);
 
 fn path_of(room: &Room, (_, content): &File) -> PathBuf {
-    room.dir.path().join("content").join(Digest::of(content).to_string())
+    room.dir.path().join("content").join(Digest::of_content(content).to_string())
 }
 
 fn versions(newest: &Newest) -> Vec<&str> {
@@ -76,7 +76,7 @@ async fn a_start_shows_the_rest() {
     let room = room.restarted().await;
     let newest = room.repository.newest().expect("shown");
     assert_eq!((versions(&newest), newest.unread.len()), (vec!["1.0.0"], 2));
-    assert!(newest.lists(Digest::of(&new[0].1)), "it is listed as before");
+    assert!(newest.lists(Digest::of_content(&new[0].1)), "it is listed as before");
     give_back(&path_of(&room, &new[0]));
     room.repository.documents().follow().await.expect("readable");
     let newest = room.repository.newest().expect("shown");

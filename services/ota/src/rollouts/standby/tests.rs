@@ -256,7 +256,7 @@ async fn a_leader_of_roll_outs_that_ends_as_asked_hands_over_at_once() {
 async fn a_bundle_that_the_disk_does_not_give_is_not_unlisted_and_is_there_again_without_a_start() {
     let world = World::new();
     let walk = files("walk", "1.0.0");
-    let manifest = world.dir.path().join("ota/content").join(Digest::of(&walk[0].1).to_string());
+    let manifest = world.dir.path().join("ota/content").join(Digest::of_content(&walk[0].1).to_string());
     let process = world.process().await;
     release(&process.ota, &walk).await;
     secs(2).await;

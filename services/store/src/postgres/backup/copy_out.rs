@@ -45,7 +45,7 @@ impl PostgresCopy {
     /// # Errors
     /// If the database cannot be reached, was written by a newer release, has only one of the schemas or a table that this user may not read
     /// whole, or the files cannot be written. Some are there then.
-    pub fn take<'a>(config: &'a PostgresConfig, folder: &'a Path) -> Boxed<'a, Result<Option<Self>, OpenError>> {
+    pub fn begin<'a>(config: &'a PostgresConfig, folder: &'a Path) -> Boxed<'a, Result<Option<Self>, OpenError>> {
         Box::pin(async move {
             let mut connection = Database::new(config, CONTROL_SCHEMA)?.copier().await?;
             in_time(sqlx::raw_sql(read::BEGIN).execute(&mut connection)).await.map_err(failed)?;

@@ -9,7 +9,7 @@ async fn a_damaged_file_that_only_the_standby_has_read_is_told_once() {
     let world = World::new();
     let (leader, standby, _) = with_a_release(&world).await;
     let content = files("walk", "1.0.0").remove(1).1;
-    let digest = Digest::of(&content);
+    let digest = Digest::of_content(&content);
     let path = world.dir.path().join("ota").join("content").join(digest.to_string());
     std::fs::write(path, vec![0; content.len()]).expect("damaged");
     let opened = standby.ota.opened().expect("keys");

@@ -40,15 +40,15 @@ async fn a_start_a_takeover_and_turns_read_nothing_of_what_has_ended() {
     let leader = world.process_over(counted[0].clone()).await;
     let first = world.holder().await;
     let standby = world.process_over(counted[1].clone()).await;
-    let started = counted.each_ref().map(|store| store.take());
+    let started = counted.each_ref().map(|store| store.take_count());
     assert!(started.iter().all(|rows| *rows > ROBOTS as usize && *rows <= READ_BY_A_START), "{started:?}");
     secs(10).await;
-    let turned = counted.each_ref().map(|store| store.take());
+    let turned = counted.each_ref().map(|store| store.take_count());
     assert!(turned.iter().all(|rows| *rows <= READ_BY_TURNS), "{turned:?}");
     leader.kill();
     secs(8).await;
     assert_ne!(world.holder().await, first);
-    let taken_over = counted[1].take();
+    let taken_over = counted[1].take_count();
     assert!(taken_over > ROBOTS as usize && taken_over <= READ_BY_A_START, "{taken_over}");
     assert_eq!(held(&standby).await, (0, 0));
     standby.end().await;

@@ -9,7 +9,7 @@ async fn change(world: &World, id: &str) -> u64 {
     let (row, revision) = world.row::<Rollout>(id).await.expect("a row");
     let row = Rollout { version: row.version + 1, ..row };
     let mut item = Item::new(Writer::Ota, "tests");
-    item.put(&row, Expect::At(revision), "rollout.changed");
+    item.put_row(&row, Expect::At(revision), "rollout.changed");
     assert!(world.store.commit(vec![item]).await.iter().all(Result::is_ok));
     row.version
 }
