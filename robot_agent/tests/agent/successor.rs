@@ -2,7 +2,7 @@
 //!
 //! The newer version is this one, with a hand that adds to its files what a release may add (record 0095): a field in
 //! each object, a column in each table, a table, a fact, a lane, a kind of subject, a line in each record. The beacon
-//! of a newer launcher is read in the room that hears it (services/telemetry/src/ear.rs).
+//! of a newer launcher is read in the room that hears it (services/telemetry/src/beacons.rs).
 
 use crate::lanes::{holder, succeeded};
 use crate::release::Releases;

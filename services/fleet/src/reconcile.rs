@@ -9,10 +9,10 @@
 use crate::requests::{Asked, Look, MapOutdated, Parts, Request};
 use midshift_core::fleet::projection::{self, FleetProjection};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, explain, found, maps, objects};
+use midshift_core::idempotency;
 use midshift_core::identity::Actor;
 use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
-use midshift_core::once;
 use midshift_core::projection::entries_of;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Key, Log, Seq, Table};
@@ -425,7 +425,7 @@ impl Loop {
                     let Asked { command, seen, validate_only, by, request_id, .. } = &*asked;
                     let permitted = objects::permit(&self.view, &self.board, by, command);
                     let repeat = permitted.and_then(|()| match request_id {
-                        Some(id) => once::is_repeat(&self.view.command_keys, id, command, *seen),
+                        Some(id) => idempotency::is_repeat(&self.view.command_keys, id, command, *seen),
                         None => Ok(false),
                     });
                     let actor = Actor::from(by);
@@ -450,7 +450,7 @@ impl Loop {
                         midshift_core::fleet::Tx::new(&mut self.view, now, &actor).on_request(request_id.as_deref());
                     commands::apply(&mut tx, &self.board, command, actor.name());
                     if let Some(id) = request_id {
-                        once::remember(&mut tx, id, command, *seen);
+                        idempotency::remember(&mut tx, id, command, *seen);
                     }
                     let unknown = tx.unknown_row();
                     if plan.keep_decision(tx) {

@@ -16,7 +16,7 @@ use midshift_core::privacy;
 use midshift_core::rows::{Item, Key, Part, Row, Table, Writer};
 use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskState};
 use midshift_core::time::{Clock, Utc};
-use midshift_store::{Cursor, Error, Query, Store, aged, load};
+use midshift_store::{Cursor, Error, Query, Store, expired_rows, load};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
@@ -36,7 +36,7 @@ pub fn prune<'a>(store: &'a dyn Store, clock: &dyn Clock) -> Boxed<'a, Result<u6
         let tasks = prune_tasks(store, utc).await?;
         let errands = prune_errands(store, utc).await?;
         let counters = prune_counters(store, utc).await?;
-        let robots = aged::forget_robots(store, Writer::Fleet, utc).await?;
+        let robots = expired_rows::forget_robots(store, Writer::Fleet, utc).await?;
         Ok(tasks + errands + counters + robots + prune_commands(store, now.steady_wall()).await?)
     })
 }
@@ -44,7 +44,7 @@ pub fn prune<'a>(store: &'a dyn Store, clock: &dyn Clock) -> Boxed<'a, Result<u6
 /// A used request_id goes with the commands after it; where there are none, here.
 async fn prune_commands(store: &dyn Store, wall: Utc) -> Result<u64, Error> {
     match privacy::retention_of(Table::CommandKey).before(wall) {
-        Some(before) => aged::take_away(store, Table::CommandKey, before.0, "command.forgotten").await,
+        Some(before) => expired_rows::take_away(store, Table::CommandKey, before.0, "command.forgotten").await,
         None => Ok(0),
     }
 }
@@ -112,7 +112,7 @@ async fn forget_tasks(store: &dyn Store, tasks: &[(TaskState, Row)]) -> Result<u
         }
         items.push(gone(rows, "task.forgotten"));
     }
-    aged::commit_all(store, items).await
+    expired_rows::commit_all(store, items).await
 }
 
 /// Errands are ordered by when they were offered, behind all attempts of tasks.
@@ -135,7 +135,7 @@ async fn prune_errands(store: &dyn Store, now: Utc) -> Result<u64, Error> {
             needed = Some(named(store).await?);
         }
         old.retain(|row| needed.as_ref().is_some_and(|needed| !needed.contains(&row.key)));
-        forgotten += aged::commit(store, gone(old, "errand.forgotten")).await?;
+        forgotten += expired_rows::commit(store, gone(old, "errand.forgotten")).await?;
         if is_last {
             return Ok(forgotten);
         }
@@ -162,7 +162,7 @@ async fn prune_counters(store: &dyn Store, now: Utc) -> Result<u64, Error> {
         }
     }
     let items = old.chunks(limits::ITEM_ROWS_MAX).map(|rows| gone(rows.to_vec(), "counter.forgotten"));
-    aged::commit_all(store, items.collect()).await
+    expired_rows::commit_all(store, items.collect()).await
 }
 
 async fn is_newest(store: &dyn Store, row: &Row) -> Result<bool, Error> {

@@ -7,9 +7,9 @@ use crate::reconcile::Loop;
 use crate::{Asked, Request};
 use midshift_core::fleet::commands;
 use midshift_core::fleet::{LOGS, Tx, follow_rows, objects, reread};
+use midshift_core::idempotency;
 use midshift_core::identity::Actor;
 use midshift_core::limits;
-use midshift_core::once;
 use midshift_core::projection;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Entry, Item, Key, Table};
@@ -107,7 +107,7 @@ impl Loop {
         let Asked { command, seen, validate_only, by, request_id, .. } = asked;
         objects::permit(&self.view, &self.board, by, command)?;
         if let Some(id) = request_id
-            && once::is_repeat(&self.view.command_keys, id, command, *seen)?
+            && idempotency::is_repeat(&self.view.command_keys, id, command, *seen)?
         {
             return Ok(None);
         }
@@ -120,7 +120,7 @@ impl Loop {
         let mut tx = Tx::new(&mut self.view, now, &actor).on_request(request_id.as_deref());
         commands::apply(&mut tx, &self.board, command, actor.name());
         if let Some(id) = request_id {
-            once::remember(&mut tx, id, command, *seen);
+            idempotency::remember(&mut tx, id, command, *seen);
         }
         let item = tx.finish();
         self.view.rest();

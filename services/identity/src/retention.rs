@@ -14,7 +14,7 @@ use midshift_core::identity::{RobotIdentity, ServerCertificate, TokenName, Token
 use midshift_core::limits;
 use midshift_core::rows::{Expect, Item, Key, Record, Row, Table, Writer};
 use midshift_core::time::{Clock, Now, Utc};
-use midshift_store::{Cursor, Error, GET_KEYS_MAX, Query, Store, aged, load};
+use midshift_store::{Cursor, Error, GET_KEYS_MAX, Query, Store, expired_rows, load};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -49,7 +49,7 @@ async fn prune_tokens(store: &dyn Store, wall: Utc) -> Result<u64, Error> {
             }
         }
         if is_last {
-            return aged::commit_all(store, items).await;
+            return expired_rows::commit_all(store, items).await;
         }
     }
 }
@@ -79,13 +79,13 @@ async fn prune_servers(store: &dyn Store, wall: Utc) -> Result<u64, Error> {
             items.push(item);
         }
     }
-    aged::commit_all(store, items).await
+    expired_rows::commit_all(store, items).await
 }
 
 async fn prune_robots(store: &dyn Store, now: &Now) -> Result<u64, Error> {
     let mut retired: BTreeMap<Arc<str>, Row> = BTreeMap::new();
     for row in store.snapshot(&[Table::RobotControl]).await?.rows {
-        if row.decode::<RobotControl>().is_ok_and(|control| aged::is_gone(&control, now.steady_utc())) {
+        if row.decode::<RobotControl>().is_ok_and(|control| expired_rows::is_gone(&control, now.steady_utc())) {
             retired.insert(row.key.id.clone(), row);
         }
     }
@@ -103,5 +103,5 @@ async fn prune_robots(store: &dyn Store, now: &Now) -> Result<u64, Error> {
             }
         }
     }
-    aged::commit_all(store, items).await
+    expired_rows::commit_all(store, items).await
 }

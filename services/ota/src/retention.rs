@@ -15,7 +15,7 @@ use midshift_core::rollout::ended;
 use midshift_core::rollout::rows::{Bundle, Quarantine, RobotSoftware, Rollout};
 use midshift_core::rows::{Expect, Item, Key, Row, Table, Writer};
 use midshift_core::time::{Clock, Now, Utc};
-use midshift_store::{Cursor, Error, Query, Store, aged};
+use midshift_store::{Cursor, Error, Query, Store, expired_rows};
 use std::collections::BTreeSet;
 
 /// Robots of one item, which has the roll-out's row beside them.
@@ -29,12 +29,12 @@ pub fn prune<'a>(store: &'a dyn Store, clock: &dyn Clock) -> Boxed<'a, Result<u6
     let now = clock.now();
     Box::pin(async move {
         let keys = match privacy::retention_of(Table::OtaCommandKey).before(now.steady_wall()) {
-            Some(before) => aged::take_away(store, Table::OtaCommandKey, before.0, "command.forgotten").await?,
+            Some(before) => expired_rows::take_away(store, Table::OtaCommandKey, before.0, "command.forgotten").await?,
             None => 0,
         };
         let rollouts = prune_rollouts(store).await?;
         let bundles = prune_bundles(store, &now).await?;
-        Ok(keys + rollouts + bundles + aged::forget_robots(store, Writer::Ota, now.steady_utc()).await?)
+        Ok(keys + rollouts + bundles + expired_rows::forget_robots(store, Writer::Ota, now.steady_utc()).await?)
     })
 }
 
@@ -78,7 +78,7 @@ async fn forget_rollout(store: &dyn Store, rollout: Row) -> Result<u64, Error> {
         } else {
             item.keep_row(rollout.key.clone(), Expect::At(rollout.revision));
         }
-        let rows = aged::commit(store, item).await?;
+        let rows = expired_rows::commit(store, item).await?;
         gone += rows;
         // Somebody has changed it: another time.
         if is_last || rows == 0 {
@@ -154,7 +154,7 @@ async fn take_away(store: &dyn Store, rows: Vec<Row>, kind: &'static str) -> Res
         }
         item
     };
-    aged::commit_all(store, rows.chunks(limits::ITEM_ROWS_MAX).map(item).collect()).await
+    expired_rows::commit_all(store, rows.chunks(limits::ITEM_ROWS_MAX).map(item).collect()).await
 }
 
 #[cfg(test)]

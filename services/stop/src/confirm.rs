@@ -2,7 +2,7 @@
 //!
 //! Invariant: what is told of a robot is what [`confirmation`] makes of its own newest word; nothing is confirmed by time. Leaving early takes nothing back.
 
-use crate::acts::was_reset;
+use crate::changes::was_reset;
 use crate::inner::Inner;
 use crate::threads::lock;
 use midshift_core::ids::RobotId;
@@ -85,9 +85,9 @@ impl Watching<'_> {
     /// The stop was reset.
     fn look_at_robots(&mut self, now: &Now) -> Result<Seen, Refusal> {
         let stop_id = &self.stop.stop_id;
-        let law = lock(&self.inner.law);
-        let since = law.effective().find(|(stop, _)| stop.stop_id == *stop_id).map(|(_, since)| since);
-        drop(law);
+        let engaged_stops = lock(&self.inner.engaged_stops);
+        let since = engaged_stops.effective().find(|(stop, _)| stop.stop_id == *stop_id).map(|(_, since)| since);
+        drop(engaged_stops);
         let since = since.ok_or_else(|| was_reset(stop_id))?;
         let robots = self.inner.robots.all();
         let mut seen = Seen { news: Vec::new(), counts: v1::Counts::default(), is_over: true };

@@ -1,7 +1,7 @@
 //! What stands in the folder of a stop service, for whoever looks at it from outside, also while the service runs.
 
 use crate::audit::{self, Broken, Verified};
-use crate::law::Kept;
+use crate::engaged::Kept;
 use midshift_core::stop::Latch;
 use std::path::Path;
 

@@ -1,6 +1,6 @@
 //! The people's and programs' face: decode, call, encode.
 
-use crate::acts::{self, Wanted};
+use crate::changes::{self, Wanted};
 use crate::service::StopService;
 use crate::{confirm, status};
 use midshift_core::identity::Caller;
@@ -74,7 +74,7 @@ impl StopService {
     ) -> Result<ReceiverStream<Result<v1::EngageResponse, Status>>, Refusal> {
         let inner = self.inner.clone();
         self.is_meant(&r.site_id)?;
-        let engaged = acts::engage(&inner, wanted(r, by)?)?;
+        let engaged = changes::engage(&inner, wanted(r, by)?)?;
         let durable = inner.disk.turn(engaged.version).await;
         let (sender, stream) = mpsc::channel(WATCH_MAX);
         let room = inner.watchers.clone().try_acquire_owned().ok();
@@ -103,12 +103,12 @@ impl StopService {
         }
         bad.finish()?;
         let stop_id = stop_id.ok_or_else(|| Refusal::field("stop_id", "cannot be read"))?;
-        let resetting = acts::reset(&self.inner, stop_id, r.reason, by)?;
+        let resetting = changes::reset(&self.inner, stop_id, r.reason, by)?;
         // Before robots hear of it.
         let is_unknown = !resetting.is_known && !self.inner.robots.knows(&resetting.reset.stop_id);
         let durable = self.inner.disk.turn(resetting.version).await;
         // A disk that does not answer holds up nobody who has looked and says that it is over.
-        acts::settle(&self.inner, resetting.version);
+        changes::settle(&self.inner, resetting.version);
         let reset = Some((&resetting.reset).into());
         Ok(v1::ResetResponse { reset, durable, was_engaged: resetting.was_engaged, is_unknown })
     }
@@ -134,7 +134,7 @@ impl StopService {
 
 /// A reader asks whoever follows. One that reads nothing hears of it when its connection ends, which is soon.
 async fn goes_on_elsewhere<T>(reader: &mpsc::Sender<Result<T, Status>>) {
-    let _ = reader.send(Err(to_status(&acts::ends(), None))).await;
+    let _ = reader.send(Err(to_status(&changes::ends(), None))).await;
 }
 
 fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {

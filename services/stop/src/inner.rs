@@ -1,10 +1,10 @@
 //! What the service is built from, and what its lines, its calls and its writer share.
 
 use crate::disk::Disk;
-use crate::ground::Ground;
-use crate::law::Law;
+use crate::engaged::EngagedStops;
 use crate::proof::Key;
 use crate::robots::Robots;
+use crate::site_index::SiteIndex;
 use midshift_core::ids::SiteId;
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, LinkTime, Utc};
@@ -29,11 +29,11 @@ pub(crate) struct Inner {
     pub clock: Arc<dyn Clock>,
     /// Which site's; none: there is no site file.
     pub site_id: Option<SiteId>,
-    pub ground: Ground,
+    pub site_index: SiteIndex,
     pub key: Key,
-    /// Taken before `law` by whoever changes it: lines hear of changes in their order.
+    /// Taken before `engaged_stops` by whoever changes it: lines hear of changes in their order.
     pub fan: Mutex<()>,
-    pub law: Mutex<Law>,
+    pub engaged_stops: Mutex<EngagedStops>,
     pub robots: Robots,
     pub disk: Disk,
     /// Counts what watchers may want to look at.

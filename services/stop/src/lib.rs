@@ -7,36 +7,36 @@
 //! queue or another service lies on its way; an engage waits for no robot, and for the disk only with its answer; a folder without its memory, or one that
 //! cannot be read, begins with the fleet stopped. Absent on purpose: who may come in: that is the port's, and is told here only so that it can be recorded.
 
-mod acts;
 pub mod audit;
+mod changes;
 mod confirm;
 mod disk;
-mod down;
+mod downlink;
+mod engaged;
 mod error;
-mod face;
-mod first;
+mod first_start;
 mod folder;
 mod frames;
-mod ground;
 mod grpc;
 mod holder;
 mod inner;
-mod law;
 mod line;
 mod opening;
 mod outbox;
 pub mod port;
 pub mod program;
 mod proof;
+mod robot_rpc;
 mod robots;
 mod service;
+mod site_index;
 mod snapshot;
 mod status;
 mod threads;
 mod writer;
 
 pub use error::Error;
-pub use first::{FIRST, announce_first_start, withdraw_first_start};
+pub use first_start::{FIRST, announce_first_start, withdraw_first_start};
 pub use folder::{latch, verify};
 pub use holder::{HOLDER, NotEnded, end_holder, is_held};
 pub use inner::Parts;

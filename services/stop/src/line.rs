@@ -4,9 +4,9 @@
 //! none. A line on which nothing comes up, nothing is read or a message breaks the rules ends with a status that says so:
 //! the robot's own silence does the rest.
 
-use crate::acts;
 use crate::audit::{Action, Note};
-use crate::down::Down;
+use crate::changes;
+use crate::downlink::Down;
 use crate::inner::Inner;
 use crate::outbox::{End, Outbox};
 use crate::robots::{Comes, Held, Robot, Robots};
@@ -59,13 +59,13 @@ async fn begin(
     by.is_robot(&robot_id)?;
     let robot = inner.robots.find_or_add(&robot_id)?;
     let listed = stops.iter().map(|stop| &stop.stop_id).chain(&more).cloned().collect();
-    let foreign = acts::adopt(inner, &robot_id, stops, more);
+    let foreign = changes::adopt(inner, &robot_id, stops, more);
     let outbox = Arc::new(Outbox::new(listed));
     let now = inner.clock.now();
     let attached = {
         // No change of the latch falls between: the line begins with the whole, and hears of everything after it.
         let _fan = lock(&inner.fan);
-        acts::is_open(inner)?;
+        changes::is_open(inner)?;
         Robots::attach(&robot, &outbox, Comes { boot_id, foreign }, now.link)
     };
     attached.map_err(|held| held_by_another(inner, &robot_id, by, held, &now))?;
@@ -177,7 +177,7 @@ fn take_message(
 
 fn check_in(inner: &Inner, robot: &Robot, outbox: &Arc<Outbox>, said: CheckIn, now: &Now) {
     // Before the answer: if the latch cannot be looked at, nobody is answered.
-    let at = lock(&inner.law).generation();
+    let at = lock(&inner.engaged_stops).generation();
     let nonce = said.nonce;
     let heard = Heard {
         at: now.link,

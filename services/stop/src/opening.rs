@@ -4,11 +4,11 @@
 //! stopped too. What cannot be read is moved aside and kept. Nobody changes a folder that another process has.
 
 use crate::audit::{self, Action, Audit, Note};
+use crate::engaged::{Kept, draw_unused};
 use crate::error::Error;
-use crate::first::{FIRST, withdraw_first_start};
+use crate::first_start::{FIRST, withdraw_first_start};
 use crate::folder::LATCH;
 use crate::holder::Holder;
-use crate::law::{Kept, draw_unused};
 use crate::proof::{Found, Key};
 use crate::writer::Writer;
 use midshift_core::limits;

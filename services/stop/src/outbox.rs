@@ -3,8 +3,8 @@
 //! Invariant: bounded, and whoever puts something in never waits. A robot that reads too slowly is told everything anew from the latch when it reads again, so that
 //! nothing is lost by leaving messages out. An answer to a check-in never overtakes what it speaks of.
 
+use crate::engaged::EngagedStops;
 use crate::frames;
-use crate::law::Law;
 use crate::proof::Key;
 use crate::threads::lock;
 use bytes::Bytes;
@@ -153,9 +153,14 @@ impl Outbox {
     }
 
     /// What the connection sends next: of a robot that is behind, from the latch. Whoever puts something in later wakes it.
-    pub fn poll_next(&self, law: &Mutex<Law>, key: &Key, cx: &mut Context<'_>) -> Poll<Option<Result<Bytes, Status>>> {
+    pub fn poll_next(
+        &self,
+        engaged_stops: &Mutex<EngagedStops>,
+        key: &Key,
+        cx: &mut Context<'_>,
+    ) -> Poll<Option<Result<Bytes, Status>>> {
         let mut waiting = lock(&self.waiting);
-        if let Some(bytes) = waiting.next(law, key) {
+        if let Some(bytes) = waiting.next(engaged_stops, key) {
             return Poll::Ready(Some(Ok(bytes)));
         }
         // The connection takes more than there is.
@@ -178,16 +183,16 @@ impl Outbox {
 }
 
 impl Waiting {
-    fn next(&mut self, law: &Mutex<Law>, key: &Key) -> Option<Bytes> {
+    fn next(&mut self, engaged_stops: &Mutex<EngagedStops>, key: &Key) -> Option<Bytes> {
         if let Some(bytes) = self.whole.pop_front() {
             return Some(bytes);
         }
         if let Some(resets) = self.behind.take() {
-            let mut law = lock(law);
-            self.whole.extend(law.everything().iter().cloned());
-            let resets = resets.iter().filter_map(|id| law.latch().reset_of(id));
+            let mut engaged_stops = lock(engaged_stops);
+            self.whole.extend(engaged_stops.everything().iter().cloned());
+            let resets = resets.iter().filter_map(|id| engaged_stops.latch().reset_of(id));
             self.whole.extend(frames::told([], resets, 0));
-            self.sent = law.generation();
+            self.sent = engaged_stops.generation();
             self.whole.push_back(frames::synced(self.sent, &key.public()));
             return self.whole.pop_front();
         }
@@ -208,7 +213,7 @@ impl Waiting {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::acts::{self, Wanted};
+    use crate::changes::{self, Wanted};
     use crate::{Parts, StopService};
     use midshift_core::identity::Caller;
     use midshift_core::robot::StopLevel;
@@ -250,15 +255,16 @@ mod tests {
             request: None,
             actor: "anna".into(),
         };
-        let stop_id = acts::engage(&inner, wanted).unwrap().stop.stop_id;
+        let stop_id = changes::engage(&inner, wanted).unwrap().stop.stop_id;
         let outbox = Outbox::new(BTreeSet::new());
-        let heard =
-            || -> Vec<Bytes> { std::iter::from_fn(|| lock(&outbox.waiting).next(&inner.law, &inner.key)).collect() };
+        let heard = || -> Vec<Bytes> {
+            std::iter::from_fn(|| lock(&outbox.waiting).next(&inner.engaged_stops, &inner.key)).collect()
+        };
         heard();
         let resetting =
-            acts::reset(&inner, stop_id, "over".to_owned(), &Caller::local()).expect("nobody is asked here");
+            changes::reset(&inner, stop_id, "over".to_owned(), &Caller::local()).expect("nobody is asked here");
         // The latch has it; the lines are told one after the other, and this one checks in twice before its turn.
-        let (reset, generation) = lock(&inner.law).settle(resetting.version, Utc(1_000)).remove(0);
+        let (reset, generation) = lock(&inner.engaged_stops).settle(resetting.version, Utc(1_000)).remove(0);
         outbox.answer(1, generation, LinkTime(5));
         outbox.answer(2, generation, LinkTime(5));
         let synced = frames::synced(generation, &inner.key.public());

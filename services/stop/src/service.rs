@@ -4,12 +4,12 @@
 
 use crate::audit::{Action, Note};
 use crate::disk::Disk;
+use crate::engaged::EngagedStops;
 use crate::error::Error;
-use crate::face::LinkFace;
-use crate::ground::Ground;
 use crate::inner::{Inner, Parts};
-use crate::law::Law;
+use crate::robot_rpc::LinkFace;
 use crate::robots::Robots;
+use crate::site_index::SiteIndex;
 use crate::threads::lock;
 use crate::writer::{self, Writer};
 use crate::{opening, snapshot};
@@ -54,10 +54,10 @@ impl StopService {
         let ended = CancellationToken::new();
         let inner = Arc::new(Inner {
             site_id: site.as_deref().map(|site| site.site_id().clone()),
-            ground: Ground::of_site(site.as_deref()),
+            site_index: SiteIndex::of_site(site.as_deref()),
             key: opened.key,
             fan: Mutex::new(()),
-            law: Mutex::new(Law::begin(opened.kept, now.wall)),
+            engaged_stops: Mutex::new(EngagedStops::begin(opened.kept, now.wall)),
             robots: Robots::default(),
             disk: Disk::default(),
             changed: watch::Sender::new(0),
@@ -70,7 +70,7 @@ impl StopService {
         });
         opened.notes.into_iter().for_each(|note| inner.disk.note(note));
         snapshot::look_first(&inner, &folder);
-        let engaged = lock(&inner.law).latch().effective().count();
+        let engaged = lock(&inner.engaged_stops).latch().effective().count();
         inner.disk.note(Note::own(now.wall, Action::Started).with("engaged", engaged));
         tracing::info!(engaged, "stop service opened");
         Ok(Self { inner, folder, writer: Arc::new(Mutex::new(Some(opened.writer))) })
@@ -86,7 +86,7 @@ impl StopService {
 
     /// Stops that are engaged now.
     pub fn engaged(&self) -> usize {
-        lock(&self.inner.law).latch().effective().count()
+        lock(&self.inner.engaged_stops).latch().effective().count()
     }
 
     /// Both faces, health of both, and reflection of these and nothing else.
@@ -140,7 +140,7 @@ impl StopService {
     /// Looks at what every stop and every check-in needs. One that hangs does not come back from here.
     pub fn look_at_locks(&self) {
         drop(lock(&self.inner.fan));
-        drop(lock(&self.inner.law));
+        drop(lock(&self.inner.engaged_stops));
     }
 
     /// Records that another process is ready to follow this one, and ends. False: the disk does not hold that, or not all that is engaged and reset, so that this one
@@ -153,12 +153,12 @@ impl StopService {
             }
             // What comes in between waits for the disk, and whoever asked for it for this service.
             for _ in 0..FOLLOW_TRIES {
-                let version = lock(&inner.law).version();
+                let version = lock(&inner.engaged_stops).version();
                 if !inner.disk.turn(version).await {
                     return false;
                 }
                 let _fan = lock(&inner.fan);
-                if inner.disk.holds(lock(&inner.law).version()) {
+                if inner.disk.holds(lock(&inner.engaged_stops).version()) {
                     inner.shutdown.cancel();
                     return true;
                 }

@@ -3,7 +3,7 @@
 //! Invariant: written whole under another name and renamed, so that a reader never sees half; one that cannot be read is told once, and the last good
 //! one stays in force.
 
-use crate::acts;
+use crate::changes;
 use crate::inner::Inner;
 use crate::threads::blocking;
 use midshift_core::identity::Directory;
@@ -174,7 +174,7 @@ fn look_at_both(folder: &Path, marks: [Option<Mark>; 2]) -> Looked {
 fn take_both(inner: &Inner, looked: Looked) -> [Option<Mark>; 2] {
     looked.roster.into_iter().for_each(|roster| apply_roster(inner, roster));
     match looked.copied {
-        Some(Ok(copied)) => acts::take_copied(inner, copied.stops),
+        Some(Ok(copied)) => changes::take_copied(inner, copied.stops),
         Some(Err(error)) => tracing::error!(error, "the stops that the store has cannot be read; those here stay"),
         None => {}
     }

@@ -99,9 +99,9 @@ fn is_heard(heard: &Heard, now: &Now) -> bool {
 pub fn status(inner: &Inner) -> v1::Status {
     let now = inner.clock.now();
     let (mut stops, version, resets): (Vec<(Stop, u64)>, u64, BTreeSet<StopId>) = {
-        let law = lock(&inner.law);
-        let stops = law.effective().map(|(stop, since)| (stop.clone(), since)).collect();
-        (stops, law.version(), law.latch().resets().map(|reset| reset.stop_id.clone()).collect())
+        let engaged_stops = lock(&inner.engaged_stops);
+        let stops = engaged_stops.effective().map(|(stop, since)| (stop.clone(), since)).collect();
+        (stops, engaged_stops.version(), engaged_stops.latch().resets().map(|reset| reset.stop_id.clone()).collect())
     };
     stops.sort_by(|(a, _), (b, _)| (a.engaged, &a.stop_id).cmp(&(b.engaged, &b.stop_id)));
     let mut tally = Tally::new(&stops);

@@ -2,11 +2,11 @@
 //!
 //! Invariant: what the disk refused is tried again each second and with each change; who waits for it hears after each turn how far it is.
 
-use crate::acts;
 use crate::audit::{Audit, Note, Tail};
+use crate::changes;
+use crate::engaged::Kept;
 use crate::holder::Holder;
 use crate::inner::Inner;
-use crate::law::Kept;
 use crate::threads::{blocking, lock};
 use midshift_core::limits;
 use midshift_core::time::Utc;
@@ -61,7 +61,7 @@ pub async fn write_until_end(inner: &Arc<Inner>, mut writer: Writer) {
         // Whatever comes from now on wakes it again, or is refused.
         let (is_last, version) = {
             let _fan = lock(&inner.fan);
-            (inner.shutdown.is_cancelled(), lock(&inner.law).version())
+            (inner.shutdown.is_cancelled(), lock(&inner.engaged_stops).version())
         };
         let is_due = !inner.disk.holds(version);
         let tail_is_due = writer.audit.tail() != &writer.known;
@@ -80,7 +80,7 @@ pub async fn write_until_end(inner: &Arc<Inner>, mut writer: Writer) {
         tokio::select! {
             () = inner.disk.woken() => {}
             () = inner.shutdown.cancelled() => {}
-            _ = forget.tick() => lock(&inner.law).forget(inner.clock.now().wall),
+            _ = forget.tick() => lock(&inner.engaged_stops).forget(inner.clock.now().wall),
             () = tokio::time::sleep(again), if refusing != Refusing::default() => {}
         }
     }
@@ -88,7 +88,7 @@ pub async fn write_until_end(inner: &Arc<Inner>, mut writer: Writer) {
 
 async fn turn(inner: &Arc<Inner>, mut writer: Writer, version: u64, is_due: bool) -> (Writer, Refusing) {
     let now = inner.clock.now().wall;
-    let kept = is_due.then(|| lock(&inner.law).kept(writer.audit.tail().clone()));
+    let kept = is_due.then(|| lock(&inner.engaged_stops).kept(writer.audit.tail().clone()));
     let (notes, queued) = inner.disk.take_notes(now);
     let (back, turn) = blocking(move || {
         let turn = writer.turn(kept, notes, now);
@@ -101,7 +101,7 @@ async fn turn(inner: &Arc<Inner>, mut writer: Writer, version: u64, is_due: bool
         tracing::debug!(%error, "the latch was not written");
         if matches!(error, Error::TooLarge { .. }) {
             tracing::error!("the latch does not fit its file: the older half of its resets is forgotten");
-            lock(&inner.law).shorten(now);
+            lock(&inner.engaged_stops).shorten(now);
         }
     }
     if let Err((error, notes)) = turn.audit {
@@ -109,7 +109,7 @@ async fn turn(inner: &Arc<Inner>, mut writer: Writer, version: u64, is_due: bool
         tracing::debug!(%error, "the audit was not written");
         inner.disk.put_back(notes);
     }
-    acts::settle(inner, version);
+    changes::settle(inner, version);
     inner.disk.end_turn(version, is_due && !refusing.latch, (!refusing.audit).then_some(queued));
     inner.touch();
     (back, refusing)

@@ -7,11 +7,10 @@
 //!
 //! What is volatile (heartbeats, poses) is on the [`LiveBoard`], which several processes share through the [`HeardLog`]; what is bulky (samples) is in the [`FrameLog`]; neither is a row.
 
-pub mod aged;
-mod amend;
 mod audit;
 mod board;
 mod check;
+pub mod expired_rows;
 mod frames;
 mod frames_pack;
 mod frames_queue;
@@ -27,6 +26,7 @@ mod open_error;
 mod postgres;
 mod projection;
 mod queue;
+mod restored_rows;
 mod sql;
 mod sqlite;
 mod store;

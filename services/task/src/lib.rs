@@ -4,18 +4,18 @@
 //! admitted task is fleet's.
 
 mod admit;
-mod ask;
+mod authorization;
 mod batch;
+mod commands;
+mod filtered_commands;
 mod grpc;
-mod images;
 mod list;
-mod many;
 mod prune;
-mod reach;
 mod resume;
 mod rows;
 mod search;
 mod watch;
+mod watch_state;
 
 use midshift_core::Boxed;
 use midshift_core::limits;

@@ -9,7 +9,7 @@ use midshift_core::limits;
 use midshift_core::privacy;
 use midshift_core::rows::{Item, Key, Row, Table, Writer};
 use midshift_core::task::TaskIntake;
-use midshift_store::{Cursor, Error, Query, aged};
+use midshift_store::{Cursor, Error, Query, expired_rows};
 use std::collections::BTreeSet;
 
 /// Rows of one item, which others' commits pass between.
@@ -27,7 +27,7 @@ impl TaskService {
             let (mut gone, now) = (0, self.inner.parts.clock.now().steady_wall());
             for (table, kind) in KEPT {
                 if let Some(before) = privacy::retention_of(table).before(now) {
-                    gone += aged::take_away(self.store(), table, before.0, kind).await?;
+                    gone += expired_rows::take_away(self.store(), table, before.0, kind).await?;
                 }
             }
             Ok(gone + self.prune_intakes().await?)
@@ -56,7 +56,7 @@ impl TaskService {
             for row in rows.into_iter().filter(|row| !stay.contains(&row.key.id)) {
                 item.delete(row.key, row.revision, "task.intake_forgotten");
             }
-            gone += aged::commit(self.store(), item).await?;
+            gone += expired_rows::commit(self.store(), item).await?;
             if is_last {
                 break;
             }

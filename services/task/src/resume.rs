@@ -4,7 +4,7 @@
 //! after the stop service has answered it, so it is waited for a little.
 
 use crate::TaskService;
-use crate::ask::{Asked, hash, internal, reason_text, request_id};
+use crate::commands::{Asked, hash, internal, reason_text, request_id};
 use crate::rows::{unavailable, unknown_robot};
 use midshift_core::fleet::rows::HoldToken;
 use midshift_core::fleet::stops::Hold;

@@ -5,9 +5,9 @@
 
 use crate::TaskService;
 use crate::grpc::CallId;
-use crate::images::{Image, Images};
 use crate::rows::{read_many, robot_kept, sees, unavailable};
 use crate::search::{self, Direction, Search};
+use crate::watch_state::{Image, WatchState};
 use midshift_core::fleet::requests::allowed_resolutions;
 use midshift_core::identity::Caller;
 use midshift_core::ids::TaskId;
@@ -39,7 +39,7 @@ pub struct Watcher {
     /// Begins with the tasks as they are.
     from_now: bool,
     after: Seq,
-    images: Images,
+    watch_state: WatchState,
     /// Revisions in which existing tasks were shown, until `after` has passed `shown_until`.
     shown: BTreeMap<TaskId, Revision>,
     shown_until: Seq,
@@ -82,7 +82,7 @@ impl TaskService {
             teller: Arc::new(teller),
             from_now: r.cursor.is_empty(),
             after,
-            images: Images::default(),
+            watch_state: WatchState::default(),
             shown: BTreeMap::new(),
             shown_until: Seq(0),
             near: BTreeSet::new(),
@@ -179,7 +179,7 @@ impl Watcher {
                 }
                 page => page.map_err(unavailable)?,
             };
-            self.images.learn(store.as_ref(), &page.entries, self.after).await.map_err(unavailable)?;
+            self.watch_state.learn(store.as_ref(), &page.entries, self.after).await.map_err(unavailable)?;
             for entry in &page.entries {
                 self.change(entry).await?;
             }
@@ -194,7 +194,7 @@ impl Watcher {
     }
 
     async fn change(&mut self, entry: &Entry) -> Result<(), Stop> {
-        let Image { intake, state, attempt } = match self.images.absorb(entry) {
+        let Image { intake, state, attempt } = match self.watch_state.absorb(entry) {
             Ok(Some(image)) => image,
             Ok(None) => return Ok(()),
             Err(error) => {

@@ -1,12 +1,12 @@
 //! Holds the certificate of a session against the robot's enrolment, and says what ends a session that waits for a person's word.
 //!
 //! A certificate of the site's authority that the rows do not know was given after the backup that they were restored from, or is older than the robot's
-//! newest machine. Its machine is observed, people are told, and it takes charge once it is adopted. Invariant: the rows are asked, at each Hello: no picture of
+//! newest machine. Its machine is observed, people are told, and it takes charge once it is adopted. Invariant: the rows are asked, at each Hello: no projection of
 //! them can be late. Where nobody shows a certificate there is no enrolment, and nothing is asked.
 
+use crate::clones::SuspectedClone;
 use crate::facts::state;
 use crate::inner::Inner;
-use crate::second::Second;
 use midshift_core::fleet::NOT_ENROLLED_SEEN;
 use midshift_core::identity::{Caller, Digest, RobotIdentity};
 use midshift_core::ids::RobotId;
@@ -104,7 +104,7 @@ impl NotEnrolled {
 /// What ends a session, so that its robot comes again and is taken otherwise.
 pub enum Waits {
     /// The session of the robot in charge: it falls silent.
-    Older(Second),
+    Older(SuspectedClone),
     /// The machine is enrolled.
     Enrolment(NotEnrolled),
     /// A person takes the device key that the robot shows.

@@ -1,4 +1,4 @@
-//! Robots and their events for people and programs: decode, look at the picture and the board, encode.
+//! Robots and their events for people and programs: decode, look at the projection and the board, encode.
 
 use crate::TelemetryService;
 use crate::inner::Inner;
@@ -74,7 +74,7 @@ fn filter(wire: Option<v1::RobotFilter>, by: Caller, bad: &mut Violations) -> Fi
 }
 
 fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::Robot> {
-    let rows = inner.picture.rows();
+    let rows = inner.projection.rows();
     let session = rows.sessions.get(robot_id);
     if session.is_none() && live.is_none() {
         return None;
@@ -95,7 +95,7 @@ fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::
     let observed_since = inner.registry.observed_since(robot_id);
     let view = RobotView { robot_id, presence, session, live, area_id, durable: &durable, observed_since };
     let now = inner.parts.clock.now();
-    let beacon = inner.ear.hint(robot_id, live.map(|live| live.processed_at), &now);
+    let beacon = inner.beacons.hint(robot_id, live.map(|live| live.processed_at), &now);
     Some(v1::Robot { beacon, ..encode_robot(view, now) })
 }
 
@@ -103,7 +103,7 @@ fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::
 fn sees(inner: &Inner, by: &Caller, robot_id: &RobotId) -> bool {
     by.may_everywhere(Permission::Read) || {
         let live = inner.parts.board.get(robot_id);
-        by.may_over(Permission::Read, inner.picture.rows().area_of(live.as_deref()))
+        by.may_over(Permission::Read, inner.projection.rows().area_of(live.as_deref()))
     }
 }
 
@@ -111,7 +111,7 @@ fn admits(inner: &Inner, filter: &Filter, robot_id: &RobotId) -> bool {
     if !robot_id.as_str().starts_with(&filter.robot_id_prefix) || !sees(inner, &filter.by, robot_id) {
         return false;
     }
-    let rows = inner.picture.rows();
+    let rows = inner.projection.rows();
     let presence = shown_presence(rows.presence.get(robot_id), inner.parts.board.get(robot_id).as_deref());
     (filter.robot_ids.is_empty() || filter.robot_ids.contains(robot_id.as_str()))
         && (filter.presences.is_empty() || filter.presences.contains(&presence))
@@ -125,7 +125,7 @@ impl TelemetryService {
         let filter = filter(r.filter, by, &mut bad);
         bad.finish()?;
         let inner = &self.inner;
-        let ids = filter.candidates(&inner.picture.rows().sessions, &r.page_token);
+        let ids = filter.candidates(&inner.projection.rows().sessions, &r.page_token);
         let shown = |id: &RobotId| encode(inner, id, inner.parts.board.get(id).as_deref());
         let found = ids.iter().filter(|id| admits(inner, &filter, id));
         let found = found.filter_map(|id| Some((id.to_string(), shown(id)?)));
@@ -287,7 +287,7 @@ impl Watching<'_> {
     }
     /// Robots of the whole behind one, as many as a message takes: an unread watch holds none of the others.
     fn of_the_whole(&self, behind: Bound<RobotId>) -> Vec<RobotId> {
-        let rows = self.inner.picture.rows();
+        let rows = self.inner.projection.rows();
         rows.sessions.range((behind, Bound::Unbounded)).map(|(id, _)| id).take(ROBOTS_PER_MESSAGE).cloned().collect()
     }
     async fn tell_whole(&mut self, teller: &Teller<v1::WatchRobotsResponse>) -> Result<(), Gone> {
@@ -338,7 +338,7 @@ async fn watch(
     period: Duration,
     teller: &Teller<v1::WatchRobotsResponse>,
 ) -> Result<(), Gone> {
-    let (beats, touched) = (inner.parts.board.watch(), inner.picture.touched());
+    let (beats, touched) = (inner.parts.board.watch(), inner.projection.touched());
     let mut watching = Watching { inner, filter, beats, touched, shown: BTreeSet::new() };
     // What is there already is part of the whole.
     let _ = watching.changed();

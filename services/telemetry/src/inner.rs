@@ -1,12 +1,12 @@
 //! What the service is built from, and what sessions, RPCs and the tasks beside them share.
 
+use crate::beacons::BeaconListener;
 use crate::bugs::Bugs;
-use crate::ear::Ear;
 use crate::event_rate::EventRates;
 use crate::misreads::Misreads;
-use crate::picture::Picture;
+use crate::projection::LinkProjection;
 use crate::registry::Registry;
-use crate::shared::Shared;
+use crate::shared_heartbeats::Shared;
 use midshift_core::time::Clock;
 use midshift_core::work::Live;
 use midshift_store::{FrameLog, HeardLog, LiveBoard, Store};
@@ -33,12 +33,12 @@ pub struct Parts {
 /// What its parts share.
 pub(crate) struct Inner {
     pub parts: Parts,
-    pub picture: Picture,
+    pub projection: LinkProjection,
     pub registry: Registry,
     pub event_rates: EventRates,
     /// Robots that are refused because of what they say.
     pub misreads: Misreads,
-    pub ear: Ear,
+    pub beacons: BeaconListener,
     pub shared: Option<Shared>,
     /// Room for robots that say hello.
     pub hellos: Arc<Semaphore>,

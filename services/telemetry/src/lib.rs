@@ -3,8 +3,9 @@
 //! Called by the binary: [`TelemetryService::new`], its gRPC faces, and [`TelemetryService::run`]. Invariant: an acknowledgement leaves only
 //! after the commit that holds the data; a session and its way down never wait for the store; every stream is drained into bounded queues.
 
+mod beacons;
 mod bugs;
-mod ear;
+mod clones;
 mod enrolment;
 mod event_rate;
 mod events;
@@ -14,15 +15,14 @@ mod inner;
 mod link;
 mod misreads;
 mod offset;
-mod picture;
 pub mod precision;
 mod presence;
+mod projection;
 mod registry;
 mod replay;
 mod retention;
-mod second;
 mod session;
-mod shared;
+mod shared_heartbeats;
 mod status;
 mod stops;
 mod waits;
@@ -40,7 +40,7 @@ use midshift_proto::link::v1::link_service_server::LinkServiceServer;
 use midshift_proto::link::v1::replay_service_server::ReplayServiceServer;
 use midshift_proto::telemetry::v1::telemetry_service_server::TelemetryServiceServer;
 use midshift_store::Error;
-use picture::Picture;
+use projection::LinkProjection;
 use registry::Registry;
 use std::sync::Arc;
 use tokio::sync::{Semaphore, watch};
@@ -57,12 +57,14 @@ pub struct TelemetryService {
 impl TelemetryService {
     /// A service that ends its sessions at `shutdown`. Sessions wait until [`TelemetryService::run`] has read the store once.
     pub fn new(parts: Parts, shutdown: CancellationToken) -> Self {
-        let (picture, registry, ear) = (Picture::default(), Registry::default(), ear::Ear::default());
-        let shared = parts.heard.clone().map(shared::Shared::new);
+        let (projection, registry, beacons) =
+            (LinkProjection::default(), Registry::default(), beacons::BeaconListener::default());
+        let shared = parts.heard.clone().map(shared_heartbeats::Shared::new);
         let hellos = Arc::new(Semaphore::new(limits::HELLOS_MAX));
         let (event_rates, moving) = (event_rate::EventRates::default(), CancellationToken::new());
         let misreads = misreads::Misreads::default();
-        let inner = Inner { parts, picture, registry, event_rates, misreads, ear, shared, hellos, moving, shutdown };
+        let inner =
+            Inner { parts, projection, registry, event_rates, misreads, beacons, shared, hellos, moving, shutdown };
         Self { inner: Arc::new(inner) }
     }
     /// With the faces of robots, that of their sessions and the one beside them for old STATUS, and with that of people and programs.
@@ -78,7 +80,7 @@ impl TelemetryService {
     /// Whether the database that several processes share has not been reached for long, so that no session is held here; it may come back.
     /// None: this process needs nobody else.
     pub fn cut_off(&self) -> Option<watch::Receiver<bool>> {
-        self.inner.shared.as_ref().map(shared::Shared::cut_off)
+        self.inner.shared.as_ref().map(shared_heartbeats::Shared::cut_off)
     }
     /// Sessions in charge here.
     pub fn sessions(&self) -> usize {
@@ -97,19 +99,19 @@ impl TelemetryService {
         Box::pin(async move {
             tokio::select! {
                 () = inner.shutdown.cancelled() => {}
-                () = ear::listen(&inner.ear, &inner.picture, inner.parts.clock.as_ref(), &socket) => {}
+                () = beacons::listen(&inner.beacons, &inner.projection, inner.parts.clock.as_ref(), &socket) => {}
             }
         })
     }
-    /// Keeps the picture of rows and the presence of robots until shutdown.
+    /// Keeps the projection of rows and the presence of robots until shutdown.
     pub fn run(self) -> Boxed<'static, Result<(), Error>> {
         let inner = self.inner;
         Box::pin(async move {
             tokio::select! {
                 () = inner.shutdown.cancelled() => Ok(()),
-                result = picture::keeper::follow_rows(&inner) => result,
+                result = projection::keeper::follow_rows(&inner) => result,
                 () = presence::write_presence(&inner) => Ok(()),
-                () = shared::keep_heartbeats(inner.shared.as_ref(), &inner.parts.board, &inner.picture) => Ok(()),
+                () = shared_heartbeats::keep_heartbeats(inner.shared.as_ref(), &inner.parts.board, &inner.projection) => Ok(()),
             }
         })
     }

@@ -86,7 +86,7 @@ impl TelemetryService {
             return Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown));
         }
         let room = self.inner.hellos.clone().try_acquire_owned().map_err(|_| crowded(rand::random()))?;
-        self.inner.picture.ready().await;
+        self.inner.projection.ready().await;
         let begun = welcome::begin(&self.inner, &hello, by).await?;
         drop(room);
         tracing::info!(peer = Empty, robot_id = %hello.robot_id, session_epoch = begun.welcome.session_epoch, observed = begun.welcome.observed, "session begun");
@@ -96,7 +96,7 @@ impl TelemetryService {
         let _leave = Leave { service: self, robot_id: &robot_id, epoch, observed };
         if let Some(since) = observed {
             self.inner.registry.observe(&robot_id, since);
-            self.inner.picture.touch(&robot_id);
+            self.inner.projection.touch(&robot_id);
         }
         let message = ToRobot::Welcome(begun.welcome.clone());
         if down.send(Ok((&message).into())).await.is_err() {
@@ -133,7 +133,7 @@ impl Drop for Leave<'_> {
         match self.observed {
             Some(since) => {
                 inner.registry.lose_sight(self.robot_id, since);
-                inner.picture.touch(self.robot_id);
+                inner.projection.touch(self.robot_id);
             }
             None => inner.registry.leave(self.robot_id, self.epoch),
         }

@@ -129,7 +129,7 @@ fn is_others(inner: &Inner, robot_id: &RobotId, (presence, now): (Presence, Link
     if inner.shared.is_none() || inner.registry.is_home(robot_id) {
         return false;
     }
-    if inner.picture.rows().presence.get(robot_id).is_some_and(|row| row.presence == presence) {
+    if inner.projection.rows().presence.get(robot_id).is_some_and(|row| row.presence == presence) {
         stood.remove(robot_id);
         return true;
     }

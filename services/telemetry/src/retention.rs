@@ -8,7 +8,7 @@ use midshift_core::limits;
 use midshift_core::rows::{Item, Record, Row, Table, Writer};
 use midshift_core::time::{Clock, Utc};
 use midshift_core::work::{LaneMark, Session};
-use midshift_store::{Cursor, Error, FrameLog, FrameMark, Query, Store, aged, load};
+use midshift_store::{Cursor, Error, FrameLog, FrameMark, Query, Store, expired_rows, load};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Takes away what is past its time. Gives back how many rows went.
@@ -19,7 +19,7 @@ pub fn prune<'a>(store: &'a dyn Store, frames: &'a dyn FrameLog, clock: &dyn Clo
     let now = clock.now();
     Box::pin(async move {
         let rows = prune_marks(store, now.steady_wall()).await?
-            + aged::forget_robots(store, Writer::Telemetry, now.steady_utc()).await?;
+            + expired_rows::forget_robots(store, Writer::Telemetry, now.steady_utc()).await?;
         Ok(rows + prune_frame_marks(store, frames).await?)
     })
 }
@@ -39,7 +39,7 @@ async fn prune_marks(store: &dyn Store, wall: Utc) -> Result<u64, Error> {
                 item.delete(row.key, row.revision, "lane.forgotten");
             }
         }
-        gone += aged::commit(store, item).await?;
+        gone += expired_rows::commit(store, item).await?;
         if is_last {
             return Ok(gone);
         }

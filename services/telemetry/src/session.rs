@@ -9,10 +9,10 @@ use crate::events::{Batch, Events, Outcome, commit};
 use crate::facts::count_misread;
 use crate::inner::Inner;
 use crate::offset::Offset;
-use crate::picture::Sections;
+use crate::projection::Sections;
 use crate::registry::{InCharge, Replay};
 use crate::replay::overloaded;
-use crate::shared::{News, Shared};
+use crate::shared_heartbeats::{News, Shared};
 use crate::status::{self, Arrived, StatusLane};
 use crate::stops::StopNews;
 use crate::waits::{finish, is_cut_off, next_replay, sleep_until, until_over};
@@ -116,7 +116,7 @@ pub async fn run(
 ) {
     let robot_id = hello.robot_id.clone();
     let epoch = begun.welcome.session_epoch;
-    let mut desired = inner.picture.watch(&robot_id);
+    let mut desired = inner.projection.watch(&robot_id);
     desired.mark_changed();
     let now = inner.parts.clock.now();
     let (in_charge, replays) = begun.part.unzip();
@@ -140,7 +140,7 @@ pub async fn run(
         free_bytes: hello.reported.free_bytes,
         unechoed: VecDeque::new(),
         kept: mpsc::channel(UNECHOED_MAX),
-        stops: StopNews::new(inner.picture.watch_stops()),
+        stops: StopNews::new(inner.projection.watch_stops()),
         out: Downlink::default(),
         out_since: None,
         robot_id: robot_id.clone(),
@@ -444,7 +444,7 @@ impl Session {
 
     fn arrive(&mut self, batch: &LaneBatch) -> Arrived {
         // The session before this one may have kept more since the Welcome was made: neither a hole nor to be kept again.
-        self.status.learn(self.inner.picture.durable_status(&self.robot_id, &self.ring));
+        self.status.learn(self.inner.projection.durable_status(&self.robot_id, &self.ring));
         self.status.arrive(batch, self.inner.parts.clock.now().wall)
     }
 
@@ -544,7 +544,7 @@ impl Session {
     fn status_kept(&mut self, kept: Option<u64>) {
         match kept {
             Some(seq) => {
-                self.inner.picture.status_durable(&self.robot_id, &self.ring, seq);
+                self.inner.projection.status_durable(&self.robot_id, &self.ring, seq);
                 let is_time = self.status.kept(seq);
                 if let Some((_, answer)) = self.replaying.take_if(|(last, _)| self.status.is_kept(*last)) {
                     drop(answer.send(Ok(self.status.ack())));

@@ -1,9 +1,9 @@
 //! The beginning of a session: checks the Hello, tells a succession from a clone, and makes the new epoch durable before the Welcome.
 
+use crate::clones::{SuspectedClone, heard_elsewhere, in_gap};
 use crate::enrolment::{Enrolment, Waits, accepts, known_device_key};
 use crate::inner::Inner;
 use crate::registry::{InCharge, Replay};
-use crate::second::{Second, heard_elsewhere, in_gap};
 use midshift_bundle::installed::{self, Rejection};
 use midshift_core::identity::{Caller, SessionSecret};
 use midshift_core::limits;
@@ -86,7 +86,7 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
         let waits = match enrolment {
             Enrolment::Unknown(machine) => Some(Waits::Enrolment(machine)),
             _ if is_held && !proven && !inner.parts.bugs.no_clone_fence() => {
-                Some(Waits::Older(Second::new(inner, hello, by, has_other_ring)))
+                Some(Waits::Older(SuspectedClone::new(inner, hello, by, has_other_ring)))
             }
             _ => None,
         };
@@ -138,9 +138,9 @@ async fn status_of(inner: &Inner, hello: &Hello) -> Result<u64, Refusal> {
     let ring: Arc<str> = Arc::from(hello.ring.as_str());
     if inner.shared.is_some() {
         let kept = inner.parts.frames.mark(&hello.robot_id, &ring).await.map_err(unavailable)?;
-        inner.picture.status_durable(&hello.robot_id, &ring, kept);
+        inner.projection.status_durable(&hello.robot_id, &ring, kept);
     }
-    Ok(inner.picture.durable_status(&hello.robot_id, &ring))
+    Ok(inner.projection.durable_status(&hello.robot_id, &ring))
 }
 
 fn draw_secret() -> SessionSecret {

@@ -79,7 +79,7 @@ const LOGGED: &[(&str, &str, &str)] = &[
         "why",
         "a sentence of this program, or what the system said of a process",
     ),
-    ("services/stop/src/acts.rs", "level", "one of four words"),
+    ("services/stop/src/changes.rs", "level", "one of four words"),
     ("services/stop/src/opening.rs", "why", "a sentence of this program"),
     ("services/telemetry/src/link.rs", "why", "which field breaks which rule, in the words of the decoder"),
     ("services/telemetry/src/facts.rs", "why", "which field breaks which rule, in the words of the decoder"),

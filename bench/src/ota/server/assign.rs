@@ -3,8 +3,8 @@
 //! Offered is what a robot has heard, told by the robot; a directive is sent only after its row was committed, so everybody was assigned
 //! when the last was offered it. The database is held against that afterwards.
 
-use super::hall::{Floor, GROUPS, attached};
 use super::rollouts::{Rollouts, spec};
+use super::scene::{Floor, GROUPS, attached};
 use super::trace::Trace;
 use crate::child::Child;
 use crate::ota::args::OtaArgs;

@@ -1,7 +1,7 @@
 //! The way back of idle robots: real agents with simulated bodies, on a floor whose rules let all of them out of work at once.
 
-use super::hall::{Floor, GROUPS, attached};
 use super::rollouts::{Rollouts, spec};
+use super::scene::{Floor, GROUPS, attached};
 use crate::child::Child;
 use crate::ota::args::OtaArgs;
 use crate::ota::release;

@@ -1,8 +1,8 @@
 //! A server that is killed while it assigns, and started again on what it left.
 
 use super::assign::{ID, OFFERED_WITHIN, spec_of, until_offered};
-use super::hall::{Floor, attached};
 use super::rollouts::Rollouts;
+use super::scene::{Floor, attached};
 use crate::ota::args::OtaArgs;
 use anyhow::ensure;
 use std::time::Duration;

@@ -6,8 +6,8 @@
 mod assign;
 mod back;
 mod cut;
-mod hall;
 mod rollouts;
+mod scene;
 mod sign;
 mod trace;
 

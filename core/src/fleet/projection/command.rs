@@ -1,7 +1,7 @@
 //! What people ask of fleet directly, as it is kept with its request_id. What comes of it is in `commands`.
 
+use crate::idempotency::Asked;
 use crate::ids::{AttemptId, PlaceId, RobotId};
-use crate::once::Asked;
 use crate::policy::AreaPolicy;
 use crate::rows::Table;
 use serde::{Deserialize, Serialize};

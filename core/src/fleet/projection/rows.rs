@@ -533,4 +533,4 @@ impl Record for Drain {
 }
 
 /// A used request_id of a command.
-pub type CommandKey = crate::once::CommandKey<Command>;
+pub type CommandKey = crate::idempotency::CommandKey<Command>;

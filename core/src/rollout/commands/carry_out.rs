@@ -11,10 +11,10 @@ use super::objects;
 use crate::audit::{self, Note};
 use crate::fleet::Board;
 use crate::gates::{Efforts, FailureEvidence};
+use crate::idempotency;
 use crate::identity::Actor;
 use crate::ids::{RobotId, RolloutId};
 use crate::limits;
-use crate::once;
 use crate::reason::{Code, Reason, Refusal};
 use crate::rollout::decision::directive::NoSign;
 use crate::rollout::decision::plan::{Plan, Tx};
@@ -59,7 +59,7 @@ pub fn decide_request(
     };
     objects::permit(view, board, by, command).map_err(&mut refused)?;
     if let Some(id) = request_id
-        && let Some(at) = once::done_before(&view.command_keys, id, command, *seen)?
+        && let Some(at) = idempotency::done_before(&view.command_keys, id, command, *seen)?
     {
         return Ok(Taken::Before(at));
     }
@@ -76,7 +76,7 @@ pub fn decide_request(
             if !is_done {
                 carry_out_one(&mut tx, board, command, actor);
             }
-            once::remember(&mut tx, id, command, *seen);
+            idempotency::remember(&mut tx, id, command, *seen);
             plan.items.extend(tx.finish());
         }
     }

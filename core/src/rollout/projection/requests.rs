@@ -4,9 +4,9 @@
 //! it out.
 
 use super::spec::RolloutSpec;
+use crate::idempotency;
 use crate::identity::Caller;
 use crate::ids::{BundleId, RobotId, RolloutId};
-use crate::once;
 use crate::rows::{Revision, Table};
 use crate::time::Utc;
 use serde::{Deserialize, Serialize};
@@ -122,7 +122,7 @@ impl Command {
     }
 }
 
-impl once::Asked for Command {
+impl idempotency::Asked for Command {
     const KEYS: Table = Table::OtaCommandKey;
 }
 

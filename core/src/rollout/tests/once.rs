@@ -1,8 +1,8 @@
 //! Commands that are only checked, and commands that are sent twice.
 
 use super::*;
+use crate::idempotency::CommandKey;
 use crate::identity::Caller;
-use crate::once::CommandKey;
 use crate::rollout::requests::{Ask, CheckOnly, Taken};
 
 fn pin(n: usize) -> Command {

@@ -144,7 +144,7 @@ async fn of_a_robot_that_was_retired_long_ago_only_that_it_was_stays() {
     tokio::time::advance(Duration::from_secs(2 * 86_400)).await;
     prune(&w).await;
     let now = w.clock.now().utc;
-    midshift_store::aged::forget_robots(&*w.store, Writer::Telemetry, now).await.expect("forgets");
+    midshift_store::expired_rows::forget_robots(&*w.store, Writer::Telemetry, now).await.expect("forgets");
     assert_eq!(rows(&w).await, [true, false, false, false]);
     assert!(has::<Session>(&w, robot_id(1).as_str()).await, "one that works is silent, and stays");
 }
@@ -247,7 +247,7 @@ async fn after_sixty_days_no_table_holds_more_than_after_forty_five() {
         prune(&w).await;
         for writer in Writer::ALL {
             let now = w.clock.now().utc;
-            midshift_store::aged::forget_robots(&*w.store, writer, now).await.expect("forgets");
+            midshift_store::expired_rows::forget_robots(&*w.store, writer, now).await.expect("forgets");
         }
         if day >= 45 {
             let mut rows = Vec::new();

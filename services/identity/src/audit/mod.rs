@@ -5,7 +5,7 @@
 
 mod export;
 mod grpc;
-mod look;
+mod pages;
 pub mod upkeep;
 mod verify;
 

@@ -3,7 +3,7 @@
 //! Invariant: heads are read before rows, so that every row that is asked for was there; a row that an anchor quotes is looked up where it
 //! should be, in the chain of the other service.
 
-use super::look::encode_head;
+use super::pages::encode_head;
 use super::{AuditService, page, unavailable};
 use midshift_core::audit::{AuditRow, Broken, Chain, Ends, Head, Kind, Mark, Verified, id_of};
 use midshift_core::reason::{Refusal, Violations};

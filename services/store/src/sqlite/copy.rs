@@ -5,8 +5,8 @@
 
 use super::file::{CONTROL_DB, TELEMETRY_DB};
 use super::{schema, write_sql};
-use crate::amend::amended;
 use crate::migrations::{self, Migration};
+use crate::restored_rows::amended;
 use crate::sql::{self, RENEW};
 use crate::{OpenError, StoreId};
 use midshift_core::Boxed;

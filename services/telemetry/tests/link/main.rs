@@ -1,4 +1,4 @@
-//! The robot's session and the picture of robots over real gRPC connections in memory.
+//! The robot's session and the projection of robots over real gRPC connections in memory.
 
 mod disk;
 mod enrolled;

@@ -1,4 +1,4 @@
-//! The picture of robots that people and programs see.
+//! The projection of robots that people and programs see.
 
 use crate::world::{Result, Robot, World, clock, serve, world};
 use midshift_core::fleet::rows::RobotControl;
@@ -407,9 +407,9 @@ async fn a_beacon_of_a_known_robot_is_shown_as_a_hint_beside_its_presence_and_go
     let mut robot = Robot::attach(&world, None).await?;
     robot.beat().await?;
     robot.hears(|down| down.echo).await?;
-    let ear = tokio::net::UdpSocket::bind("127.0.0.1:0").await?;
-    let address = ear.local_addr()?;
-    tokio::spawn(world.service.clone().hear_beacons(ear));
+    let beacons = tokio::net::UdpSocket::bind("127.0.0.1:0").await?;
+    let address = beacons.local_addr()?;
+    tokio::spawn(world.service.clone().hear_beacons(beacons));
     let launcher = tokio::net::UdpSocket::bind("127.0.0.1:0").await?;
     let before = get(&world).await?;
     assert_eq!(before.beacon, None);

@@ -74,4 +74,4 @@ impl Record for OtaClock {
 }
 
 /// A used request_id of a command.
-pub type CommandKey = crate::once::CommandKey<super::requests::Command>;
+pub type CommandKey = crate::idempotency::CommandKey<super::requests::Command>;

@@ -3,10 +3,10 @@
 use super::copied::{PostgresCopy, SCHEMAS, file};
 use super::copy_out::in_time;
 use super::tables::{TableShape, tables};
-use crate::amend::amended;
 use crate::migrations::{Migration, pending};
 use crate::postgres::connect::{CONTROL_SCHEMA, Database, PostgresConfig};
 use crate::postgres::{migrate, write_sql};
+use crate::restored_rows::amended;
 use crate::{OpenError, StoreId, sql};
 use midshift_core::Boxed;
 use midshift_core::ids::SiteId;

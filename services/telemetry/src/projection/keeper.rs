@@ -1,4 +1,4 @@
-//! Reads rows into the picture, and goes on with the feed.
+//! Reads rows into the projection, and goes on with the feed.
 
 use super::{Rows, Sections};
 use crate::inner::Inner;
@@ -43,13 +43,13 @@ impl Fold for Keeper {
         ]
     }
     fn reset(&mut self) {
-        let mut rows = self.inner.picture.rows_mut();
+        let mut rows = self.inner.projection.rows_mut();
         let status = std::mem::take(&mut rows.status);
         *rows = Rows { status, ..Rows::default() };
     }
     fn apply(&mut self, change: Change) -> Result<(), BadRow> {
         if change.key.table == Table::Site {
-            self.inner.picture.rows_mut().site =
+            self.inner.projection.rows_mut().site =
                 self.left_out.read_change::<SiteRow>(&change)?.and_then(|row| map_of(&row));
             return Ok(());
         }
@@ -57,11 +57,11 @@ impl Fold for Keeper {
         if change.key.table == Table::StopRecord {
             let Ok(stop_id) = StopId::parse(&id) else { return Ok(()) };
             let record = self.left_out.read_change::<StopRecord>(&change)?.map(Arc::new);
-            set_or_remove(Arc::make_mut(&mut self.inner.picture.rows_mut().stops), stop_id, record);
+            set_or_remove(Arc::make_mut(&mut self.inner.projection.rows_mut().stops), stop_id, record);
             return Ok(());
         }
         let Ok(robot_id) = RobotId::parse(id.split('/').next().unwrap_or_default()) else { return Ok(()) };
-        let mut rows = self.inner.picture.rows_mut();
+        let mut rows = self.inner.projection.rows_mut();
         match change.key.table {
             Table::DesiredWork => {
                 sections(&mut rows, &robot_id).work = self.left_out.read_change(&change)?.map(Arc::new)
@@ -82,14 +82,16 @@ impl Fold for Keeper {
         }
         drop(rows);
         match change.key.table {
-            Table::DesiredWork | Table::DesiredPolicy | Table::DesiredUpdate => self.inner.picture.publish(&robot_id),
+            Table::DesiredWork | Table::DesiredPolicy | Table::DesiredUpdate => {
+                self.inner.projection.publish(&robot_id)
+            }
             Table::Session => {
-                let newest = self.inner.picture.rows().sessions.get(&robot_id).map(|s| s.session_epoch);
+                let newest = self.inner.projection.rows().sessions.get(&robot_id).map(|s| s.session_epoch);
                 self.inner.registry.fence(&robot_id, newest.unwrap_or(0));
-                self.inner.picture.touch(&robot_id);
+                self.inner.projection.touch(&robot_id);
             }
             // A label may let it into what somebody watches, or out of it.
-            Table::Presence | Table::RobotControl => self.inner.picture.touch(&robot_id),
+            Table::Presence | Table::RobotControl => self.inner.projection.touch(&robot_id),
             _ => {}
         }
         Ok(())
@@ -111,7 +113,7 @@ fn set_or_remove<K: Ord, V>(map: &mut BTreeMap<K, V>, key: K, value: Option<V>) 
     };
 }
 
-/// Keeps the picture until the store's wakes end.
+/// Keeps the projection until the store's wakes end.
 pub async fn follow_rows(inner: &Arc<Inner>) -> Result<(), Error> {
     let mut wake = inner.parts.store.wake();
     load_status(inner).await;
@@ -121,9 +123,9 @@ pub async fn follow_rows(inner: &Arc<Inner>) -> Result<(), Error> {
         wake.mark_unchanged();
         match projection.advance(inner.parts.store.as_ref()).await {
             Ok(_) => {
-                inner.picture.publish_stops();
-                inner.picture.absorbed.send_replace(projection.seq());
-                inner.picture.ready.send_if_modified(|ready| !std::mem::replace(ready, true));
+                inner.projection.publish_stops();
+                inner.projection.absorbed.send_replace(projection.seq());
+                inner.projection.ready.send_if_modified(|ready| !std::mem::replace(ready, true));
             }
             Err(error) => {
                 tracing::warn!(%error, "telemetry cannot read the store, trying again");
@@ -145,7 +147,7 @@ pub async fn follow_rows(inner: &Arc<Inner>) -> Result<(), Error> {
 async fn load_status(inner: &Inner) {
     match inner.parts.frames.marks().await {
         Ok(marks) => {
-            let mut rows = inner.picture.rows_mut();
+            let mut rows = inner.projection.rows_mut();
             for mark in marks {
                 let known = rows.status.entry((mark.robot_id, mark.ring)).or_default();
                 *known = mark.seq.max(*known);

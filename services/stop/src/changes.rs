@@ -4,9 +4,9 @@
 //! was written and recorded, or says that it was not.
 
 use crate::audit::{Action, MIDSHIFT, Note};
+use crate::engaged::{Asked, EngagedStops, Resetting};
 use crate::frames;
 use crate::inner::Inner;
-use crate::law::{Asked, Law, Resetting};
 use crate::outbox::Frame;
 use crate::threads::lock;
 use midshift_core::identity::{Actor, Caller, Permission};
@@ -58,26 +58,26 @@ pub fn is_open(inner: &Inner) -> Result<(), Refusal> {
 /// # Errors
 /// No such part of the site; no room; the request was another one, or its stop was reset; this service ends. Nothing is engaged then.
 pub fn engage(inner: &Inner, wanted: Wanted) -> Result<Engaged, Refusal> {
-    let region = inner.ground.region(&wanted.scope)?;
+    let region = inner.site_index.region(&wanted.scope)?;
     let now = inner.clock.now();
     let fan = lock(&inner.fan);
     is_open(inner)?;
-    let mut law = lock(&inner.law);
-    if let Some(engaged) = before(&law, &wanted)? {
+    let mut engaged_stops = lock(&inner.engaged_stops);
+    if let Some(engaged) = before(&engaged_stops, &wanted)? {
         return Ok(engaged);
     }
-    law.room(&wanted.scope, wanted.level)?;
+    engaged_stops.room(&wanted.scope, wanted.level)?;
     let (actor, token_id, reason) = (wanted.actor.to_string(), wanted.actor.token().cloned(), wanted.reason);
-    let bare = Stop::new(law.draw(now.wall), wanted.scope, wanted.level, now.wall);
+    let bare = Stop::new(engaged_stops.draw(now.wall), wanted.scope, wanted.level, now.wall);
     let mut stop = Stop { actor, reason, region, token_id, ..bare };
     inner.key.mark(&mut stop);
     let request_id = wanted.request.as_ref().map(|(id, _)| id.to_string());
     let asked = wanted.request.map(|(id, hash)| (id, Asked { stop_id: stop.stop_id.clone(), hash, at: now.wall }));
-    let generation = law.engage(stop.clone(), asked);
-    let version = law.version();
+    let generation = engaged_stops.engage(stop.clone(), asked);
+    let version = engaged_stops.version();
     let note = note(Action::Engaged, &stop, now.wall);
     inner.disk.note(request_id.iter().fold(note, |note, id| note.with("request_id", id)));
-    drop(law);
+    drop(engaged_stops);
     let told = generation.map_or(0, |generation| tell_lines(inner, &stop, generation, &now));
     drop(fan);
     inner.disk.wake();
@@ -88,16 +88,16 @@ pub fn engage(inner: &Inner, wanted: Wanted) -> Result<Engaged, Refusal> {
 }
 
 /// What the same request engaged before.
-fn before(law: &Law, wanted: &Wanted) -> Result<Option<Engaged>, Refusal> {
+fn before(engaged_stops: &EngagedStops, wanted: &Wanted) -> Result<Option<Engaged>, Refusal> {
     let Some((request_id, hash)) = &wanted.request else { return Ok(None) };
-    let Some(asked) = law.asked(request_id) else { return Ok(None) };
+    let Some(asked) = engaged_stops.asked(request_id) else { return Ok(None) };
     if asked.hash != *hash {
         let text = "this request_id engaged another stop; nothing more was stopped";
         let reason = Reason::new(Code::RequestIdReused, text).with("stop_id", &asked.stop_id);
         return Err(Refusal::new(Kind::AlreadyExists, reason));
     }
-    match law.latch().stop(&asked.stop_id).filter(|stop| law.latch().is_effective(&stop.stop_id)) {
-        Some(stop) => Ok(Some(Engaged { stop: stop.clone(), version: law.version() })),
+    match engaged_stops.latch().stop(&asked.stop_id).filter(|stop| engaged_stops.latch().is_effective(&stop.stop_id)) {
+        Some(stop) => Ok(Some(Engaged { stop: stop.clone(), version: engaged_stops.version() })),
         None => Err(was_reset(&asked.stop_id)),
     }
 }
@@ -113,15 +113,15 @@ pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>, more: Vec<Stop
     let mut foreign: BTreeSet<StopId> = more.into_iter().collect();
     let mut is_lost = Vec::new();
     let forgotten = {
-        let law = lock(&inner.law);
-        foreign.retain(|stop_id| law.latch().stop(stop_id).is_none());
+        let engaged_stops = lock(&inner.engaged_stops);
+        foreign.retain(|stop_id| engaged_stops.latch().stop(stop_id).is_none());
         for stop in stops {
-            let latch = law.latch();
+            let latch = engaged_stops.latch();
             if latch.stop(&stop.stop_id).is_none() && latch.reset_of(&stop.stop_id).is_none() {
                 is_lost.push(stop);
             }
         }
-        law.latch().forgotten()
+        engaged_stops.latch().forgotten()
     };
     // Outside of the lock: a signature takes its time.
     // What is not newer than what was forgotten may have been reset: it stops the robot that brings it, and nobody else.
@@ -149,19 +149,19 @@ fn take_back(inner: &Inner, stops: Vec<Stop>, from: (&str, &str)) -> Vec<StopId>
     }
     let (mut left, mut adopted) = (Vec::new(), 0);
     for stop in stops {
-        let mut law = lock(&inner.law);
-        if law.latch().reset_of(&stop.stop_id).is_some() || law.is_resetting(&stop.stop_id) {
+        let mut engaged_stops = lock(&inner.engaged_stops);
+        if engaged_stops.latch().reset_of(&stop.stop_id).is_some() || engaged_stops.is_resetting(&stop.stop_id) {
             continue;
         }
-        let is_known = law.latch().stop(&stop.stop_id).is_some();
-        if !is_known && law.room(&stop.scope, stop.level).is_err() {
+        let is_known = engaged_stops.latch().stop(&stop.stop_id).is_some();
+        if !is_known && engaged_stops.room(&stop.scope, stop.level).is_err() {
             left.push(stop.stop_id);
             continue;
         }
-        let Some(generation) = law.engage(stop.clone(), None) else { continue };
+        let Some(generation) = engaged_stops.engage(stop.clone(), None) else { continue };
         let engaged = note(Action::Adopted, &stop, now.wall).with("engaged_by", &stop.actor);
         inner.disk.note(Note { actor: MIDSHIFT.to_owned(), ..engaged.with(from.0, from.1) });
-        drop(law);
+        drop(engaged_stops);
         tell_lines(inner, &stop, generation, &now);
         adopted += 1;
         metrics::counter!("midshift_stop_adopted_total").increment(1);
@@ -182,8 +182,9 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Res
     let now = inner.clock.now();
     let fan = lock(&inner.fan);
     is_open(inner)?;
-    let mut law = lock(&inner.law);
-    let areas = law.latch().stop(&stop_id).map(|stop| inner.ground.areas(&stop.scope)).unwrap_or_default();
+    let mut engaged_stops = lock(&inner.engaged_stops);
+    let areas =
+        engaged_stops.latch().stop(&stop_id).map(|stop| inner.site_index.areas(&stop.scope)).unwrap_or_default();
     if let Err(refusal) = by.needs(Permission::Reset, &areas) {
         let note = Note::by_actor(now.wall, Action::Denied, &by.into());
         let note = note.with("code", refusal.reason.code).with("asked", "stop.reset").with("stop_id", stop_id);
@@ -194,7 +195,7 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Res
     let (actor, token_id) = (by.to_string(), by.token().cloned());
     let mut reset = Reset { actor, reason, token_id, ..Reset::new(stop_id, now.wall) };
     inner.key.mark_reset(&mut reset);
-    let resetting = law.reset(reset);
+    let resetting = engaged_stops.reset(reset);
     if resetting.is_new {
         let Reset { stop_id, reason, .. } = &resetting.reset;
         let note = Note::by_actor(now.wall, Action::Reset, &by);
@@ -202,7 +203,7 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Res
             .disk
             .note(note.with("stop_id", stop_id).with("reason", reason).with("was_engaged", resetting.was_engaged));
     }
-    drop((law, fan));
+    drop((engaged_stops, fan));
     inner.disk.wake();
     Ok(resetting)
 }
@@ -211,7 +212,7 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Res
 pub fn settle(inner: &Inner, version: u64) {
     let now = inner.clock.now();
     let fan = lock(&inner.fan);
-    let settled = lock(&inner.law).settle(version, now.wall);
+    let settled = lock(&inner.engaged_stops).settle(version, now.wall);
     if settled.is_empty() {
         return;
     }
@@ -260,19 +261,19 @@ mod tests {
             let wanted = Wanted { scope, level, reason: String::new(), request: None, actor: "anna".into() };
             let stop = engage(&inner, wanted).unwrap().stop;
             let resetting = reset(&inner, stop.stop_id.clone(), "over".to_owned(), &Caller::local());
-            lock(&inner.law).settle(resetting.unwrap().version, inner.clock.now().wall);
+            lock(&inner.engaged_stops).settle(resetting.unwrap().version, inner.clock.now().wall);
             stop
         };
         let (old, newer) = (stop_and_reset(), stop_and_reset());
-        lock(&inner.law).shorten(inner.clock.now().wall);
-        assert!(lock(&inner.law).latch().stop(&old.stop_id).is_none(), "it is forgotten with its reset");
+        lock(&inner.engaged_stops).shorten(inner.clock.now().wall);
+        assert!(lock(&inner.engaged_stops).latch().stop(&old.stop_id).is_none(), "it is forgotten with its reset");
         let lost_id = StopId::parse("STOP-LATER").unwrap();
         let mut lost = Stop::new(lost_id.clone(), Scope::Fleet, StopLevel::Halt, newer.engaged);
         inner.key.mark(&mut lost);
         let robot_id = RobotId::parse("r1").unwrap();
         let foreign = adopt(&inner, &robot_id, vec![old.clone(), lost], Vec::new());
         assert_eq!(foreign, [old.stop_id.clone()].into(), "it is shown, and stops nobody else");
-        let law = lock(&inner.law);
-        assert!(!law.latch().is_effective(&old.stop_id) && law.latch().is_effective(&lost_id));
+        let engaged_stops = lock(&inner.engaged_stops);
+        assert!(!engaged_stops.latch().is_effective(&old.stop_id) && engaged_stops.latch().is_effective(&lost_id));
     }
 }

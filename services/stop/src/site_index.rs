@@ -12,7 +12,7 @@ const NAMES_MAX: usize = 24;
 
 /// The regions of all parts.
 #[derive(Default)]
-pub struct Ground(Option<Parts>);
+pub struct SiteIndex(Option<Parts>);
 
 struct Parts {
     areas: BTreeMap<AreaId, Option<Region>>,
@@ -21,7 +21,7 @@ struct Parts {
     around: BTreeMap<PlaceId, BTreeSet<AreaId>>,
 }
 
-impl Ground {
+impl SiteIndex {
     /// Of a site. None: there is no site file, and every part means everywhere.
     pub fn of_site(site: Option<&Site>) -> Self {
         // A part without a place on the map is everywhere.
@@ -78,13 +78,13 @@ mod tests {
     #[test]
     fn an_unknown_part_is_refused_with_what_there_is_and_without_a_site_a_part_is_everywhere() {
         let site = text::parse(DEMO).unwrap();
-        let ground = Ground::of_site(Some(&site));
+        let site_index = SiteIndex::of_site(Some(&site));
         let door = Scope::Zone(PlaceId::parse("door").unwrap());
-        assert!(ground.region(&door).unwrap().is_some());
+        assert!(site_index.region(&door).unwrap().is_some());
         let nowhere = Scope::Area(AreaId::parse("nowhere").unwrap());
-        let refusal = ground.region(&nowhere).unwrap_err();
+        let refusal = site_index.region(&nowhere).unwrap_err();
         assert_eq!(refusal.kind(), Kind::NotFound);
         assert!(refusal.reason.text().contains(site.areas()[0].area_id.as_str()), "{refusal}");
-        assert_eq!(Ground::of_site(None).region(&nowhere).unwrap(), None);
+        assert_eq!(SiteIndex::of_site(None).region(&nowhere).unwrap(), None);
     }
 }

@@ -4,7 +4,7 @@
 //! had been decided by then has gone down before it. So nobody ever knows less of a robot than it relies on, and a gateway that cannot
 //! reach the database extends no authority; when that lasts, its sessions end and its robots go to another.
 
-use crate::picture::Picture;
+use crate::projection::LinkProjection;
 use midshift_core::ids::RobotId;
 use midshift_core::work::Live;
 use midshift_store::{Heard, HeardLog, Kept, LiveBoard};
@@ -70,7 +70,7 @@ impl Shared {
 }
 
 /// Keeps heartbeats until it is dropped.
-pub async fn keep_heartbeats(shared: Option<&Shared>, board: &LiveBoard<Live>, picture: &Picture) {
+pub async fn keep_heartbeats(shared: Option<&Shared>, board: &LiveBoard<Live>, projection: &LinkProjection) {
     let queue = |shared: &Shared| shared.queue.lock().unwrap_or_else(PoisonError::into_inner).take();
     let Some((shared, mut queue)) = shared.and_then(|s| Some((s, queue(s)?))) else {
         return std::future::pending().await;
@@ -85,7 +85,7 @@ pub async fn keep_heartbeats(shared: Option<&Shared>, board: &LiveBoard<Live>, p
                 reached = Instant::now();
                 shared.cut_off.send_if_modified(|cut_off| std::mem::replace(cut_off, false));
                 if let Some(kept) = kept {
-                    publish_kept(board, picture, batch, &kept).await;
+                    publish_kept(board, projection, batch, &kept).await;
                 }
             }
             failed => {
@@ -130,7 +130,12 @@ async fn write(log: &dyn HeardLog, batch: &BTreeMap<RobotId, Waiting>) -> Result
 }
 
 /// Puts what was kept on the board and tells its sessions, once what had been decided before has come down to them.
-async fn publish_kept(board: &LiveBoard<Live>, picture: &Picture, batch: BTreeMap<RobotId, Waiting>, kept: &Kept) {
+async fn publish_kept(
+    board: &LiveBoard<Live>,
+    projection: &LinkProjection,
+    batch: BTreeMap<RobotId, Waiting>,
+    kept: &Kept,
+) {
     let (fenced, heard): (Vec<_>, Vec<_>) = batch.into_values().partition(|w| kept.fenced.contains(&w.live.robot_id));
     for waiting in &heard {
         board.publish(&waiting.live.robot_id, waiting.live.clone());
@@ -139,7 +144,7 @@ async fn publish_kept(board: &LiveBoard<Live>, picture: &Picture, batch: BTreeMa
         // A session that does not read has ended, or hears it with its next heartbeat.
         let _ = waiting.session.try_send(News::Fenced);
     }
-    let absorbed = picture.absorbed(kept.head);
+    let absorbed = projection.absorbed(kept.head);
     if tokio::time::timeout(PICTURE_WITHIN, absorbed).await.is_err() {
         tracing::warn!("heartbeats are not echoed: what was decided meanwhile cannot be read");
         return;

@@ -61,9 +61,9 @@ impl Rows {
     }
 }
 
-/// The picture, shared between sessions and RPCs.
+/// The projection, shared between sessions and RPCs.
 #[derive(Default)]
-pub struct Picture {
+pub struct LinkProjection {
     rows: RwLock<Rows>,
     watchers: Mutex<BTreeMap<RobotId, watch::Sender<Sections>>>,
     stops: watch::Sender<Arc<SiteStops>>,
@@ -74,7 +74,7 @@ pub struct Picture {
     touched: Arc<LiveBoard<()>>,
 }
 
-impl Picture {
+impl LinkProjection {
     /// Rows as they are now.
     pub fn rows(&self) -> RwLockReadGuard<'_, Rows> {
         self.rows.read().unwrap_or_else(PoisonError::into_inner)
@@ -114,12 +114,12 @@ impl Picture {
     }
     /// Waits until the store was read once.
     pub async fn ready(&self) {
-        // The sender lives as long as this picture.
+        // The sender lives as long as this projection.
         let _ = self.ready.subscribe().wait_for(|ready| *ready).await;
     }
     /// Waits until what the feed holds up to `seq` has been handed to sessions.
     pub async fn absorbed(&self, seq: Seq) {
-        // The sender lives as long as this picture.
+        // The sender lives as long as this projection.
         let _ = self.absorbed.subscribe().wait_for(|absorbed| *absorbed >= seq).await;
     }
     /// Says that something other than its newest heartbeat changed about a robot.

@@ -3,7 +3,7 @@
 //! Invariant: a task is asked for at most once a call, and what is counted as asked is durable.
 
 use crate::TaskService;
-use crate::ask::{Asked, hash, reason_text, request_id};
+use crate::commands::{Asked, hash, reason_text, request_id};
 use crate::rows::{TaskRows, read_many, sees, unavailable};
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{RequestId, TaskId};
@@ -146,7 +146,7 @@ impl TaskService {
             bad.add("resolution", "is required");
         }
         bad.finish()?;
-        let Some(resolution) = resolution else { return Err(crate::ask::internal()) };
+        let Some(resolution) = resolution else { return Err(crate::commands::internal()) };
         let same = v1::ResolveTasksRequest {
             request_id: String::new(),
             page_token: String::new(),

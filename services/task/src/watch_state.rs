@@ -16,7 +16,7 @@ const PASTS: usize = 256;
 
 /// Intakes and attempts.
 #[derive(Default)]
-pub struct Images {
+pub struct WatchState {
     intakes: BTreeMap<TaskId, TaskIntake>,
     attempts: BTreeMap<AttemptId, Attempt>,
 }
@@ -38,7 +38,7 @@ pub fn read<R: Record>(entry: &Entry) -> Result<Option<R>, BadRow> {
     Row { key, revision: entry.revision, index: entry.index.clone(), body }.decode().map(Some)
 }
 
-impl Images {
+impl WatchState {
     /// Gets to know the tasks and attempts of a stretch of the feed, as they were right after `place`, where the stretch begins.
     pub async fn learn(&mut self, store: &dyn Store, entries: &[Entry], place: Seq) -> Result<(), Error> {
         if self.intakes.len() > REMEMBERED || self.attempts.len() > REMEMBERED {

@@ -2,7 +2,7 @@
 //!
 //! A stop goes to all robots as it was encoded once. Invariant: the wire is that of `stop_link_service.proto`; a generated client cannot tell.
 
-use crate::down::Down;
+use crate::downlink::Down;
 use crate::inner::Inner;
 use crate::line;
 use bytes::{BufMut, Bytes};

@@ -19,7 +19,7 @@ use std::time::Duration;
 use tracing::field::Empty;
 
 /// Such a machine.
-pub struct Second {
+pub struct SuspectedClone {
     robot_id: RobotId,
     boot_id: String,
     /// Serial number of the certificate that it showed.
@@ -29,7 +29,7 @@ pub struct Second {
     has_other_ring: bool,
 }
 
-impl Second {
+impl SuspectedClone {
     /// Whoever said this Hello, now.
     pub fn new(inner: &Inner, hello: &Hello, by: &Caller, has_other_ring: bool) -> Self {
         let (robot_id, boot_id) = (hello.robot_id.clone(), hello.boot_id.clone());

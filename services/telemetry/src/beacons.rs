@@ -3,7 +3,7 @@
 //! Invariant: a hint for display, never evidence. Nobody proves anything with a datagram: anybody in the network can send one, so nothing is
 //! decided by it, nothing is written down, and only robots that once said Hello have one. Called by the binary.
 
-use crate::picture::Picture;
+use crate::projection::LinkProjection;
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::time::{Clock, LinkDuration, LinkTime, Now};
@@ -66,7 +66,7 @@ struct Heard {
 
 /// Beacons by robot, and who sent how many.
 #[derive(Debug, Default)]
-pub struct Ear(Mutex<State>);
+pub struct BeaconListener(Mutex<State>);
 
 #[derive(Debug, Default)]
 struct State {
@@ -75,7 +75,7 @@ struct State {
     sources: BTreeMap<IpAddr, u32>,
 }
 
-impl Ear {
+impl BeaconListener {
     fn state(&self) -> std::sync::MutexGuard<'_, State> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -139,7 +139,7 @@ fn is_fresh(heard: &Heard, now: LinkTime) -> bool {
 }
 
 /// Listens until it is dropped.
-pub async fn listen(ear: &Ear, picture: &Picture, clock: &dyn Clock, socket: &UdpSocket) {
+pub async fn listen(beacons: &BeaconListener, projection: &LinkProjection, clock: &dyn Clock, socket: &UdpSocket) {
     // One byte more than a beacon has: a longer one is seen to be too long.
     let mut datagram = [0; limits::BEACON_BYTES + 1];
     loop {
@@ -152,12 +152,12 @@ pub async fn listen(ear: &Ear, picture: &Picture, clock: &dyn Clock, socket: &Ud
             }
         };
         let now = clock.now().link;
-        let knows = |robot_id: &RobotId| picture.rows().sessions.contains_key(robot_id);
-        let taken = ear.take_in(&datagram[..length], from.ip(), now, knows);
+        let knows = |robot_id: &RobotId| projection.rows().sessions.contains_key(robot_id);
+        let taken = beacons.take_in(&datagram[..length], from.ip(), now, knows);
         let counted = if taken.is_some() { "taken" } else { "dropped" };
         metrics::counter!("midshift_beacons_total", "what" => counted).increment(1);
         if let Some(robot_id) = taken {
-            picture.touch(&robot_id);
+            projection.touch(&robot_id);
         }
     }
 }
@@ -177,8 +177,8 @@ mod tests {
         Now { site: SiteTime(0), link: LinkTime(ms), utc: Utc(0), wall: Utc(1_000_000), jump: None }
     }
 
-    fn hears(ear: &Ear, text: &str, ms: u64) -> bool {
-        ear.take_in(text.as_bytes(), FROM, LinkTime(ms), |id| id.as_str().starts_with("r")).is_some()
+    fn hears(beacons: &BeaconListener, text: &str, ms: u64) -> bool {
+        beacons.take_in(text.as_bytes(), FROM, LinkTime(ms), |id| id.as_str().starts_with("r")).is_some()
     }
 
     #[test]
@@ -213,47 +213,48 @@ mod tests {
 
     #[test]
     fn a_hint_is_shown_while_beacons_come_and_the_robot_does_not_speak_itself() {
-        let ear = Ear::default();
+        let beacons = BeaconListener::default();
         let id = robot("r1");
-        assert!(ear.hint(&id, None, &now(0)).is_none());
-        assert!(hears(&ear, "midshift-beacon 1 r1 v1 1 7\n", 10_000));
-        assert!(hears(&ear, "midshift-beacon 1 r1 v1 1 8\n", 11_000));
-        let hint = ear.hint(&id, Some(LinkTime(9_000)), &now(11_500)).expect("is shown");
+        assert!(beacons.hint(&id, None, &now(0)).is_none());
+        assert!(hears(&beacons, "midshift-beacon 1 r1 v1 1 7\n", 10_000));
+        assert!(hears(&beacons, "midshift-beacon 1 r1 v1 1 8\n", 11_000));
+        let hint = beacons.hint(&id, Some(LinkTime(9_000)), &now(11_500)).expect("is shown");
         assert_eq!((hint.set_id.as_str(), hint.tries), ("v1", 1));
         assert_eq!(hint.expected_back, Some(convert::timestamp(Utc(1_000_000 + 15_000 - 1_500))), "since the first");
         assert_eq!(hint.age, Some(convert::duration(500)));
-        assert!(ear.hint(&id, Some(LinkTime(11_000)), &now(11_500)).is_none(), "it is heard itself");
-        assert!(ear.hint(&id, None, &now(16_001)).is_none(), "nothing came for 5 s");
-        assert!(hears(&ear, "midshift-beacon 1 r1 v1 2 9\n", 20_000));
-        let hint = ear.hint(&id, None, &now(20_000)).expect("is shown");
+        assert!(beacons.hint(&id, Some(LinkTime(11_000)), &now(11_500)).is_none(), "it is heard itself");
+        assert!(beacons.hint(&id, None, &now(16_001)).is_none(), "nothing came for 5 s");
+        assert!(hears(&beacons, "midshift-beacon 1 r1 v1 2 9\n", 20_000));
+        let hint = beacons.hint(&id, None, &now(20_000)).expect("is shown");
         assert_eq!((hint.tries, hint.expected_back), (2, Some(convert::timestamp(Utc(1_015_000)))));
     }
 
     #[test]
     fn strangers_fill_no_table_and_one_source_is_heard_only_so_often() {
-        let ear = Ear::default();
-        assert!(!hears(&ear, "midshift-beacon 1 stranger v1 1 7\n", 0));
-        let heard = (0..1_000).filter(|_| hears(&ear, "midshift-beacon 1 r1 v1 1 7\n", 5)).count();
+        let beacons = BeaconListener::default();
+        assert!(!hears(&beacons, "midshift-beacon 1 stranger v1 1 7\n", 0));
+        let heard = (0..1_000).filter(|_| hears(&beacons, "midshift-beacon 1 r1 v1 1 7\n", 5)).count();
         assert_eq!(heard, limits::BEACONS_PER_SOURCE as usize - 1);
-        assert!(hears(&ear, "midshift-beacon 1 r1 v1 1 7\n", 1_000), "the next second");
+        assert!(hears(&beacons, "midshift-beacon 1 r1 v1 1 7\n", 1_000), "the next second");
         let sources = (0..2 * limits::BEACON_SOURCES_MAX as u32).map(|n| IpAddr::V4(n.into()));
-        let heard = sources
-            .filter(|from| ear.take_in(b"midshift-beacon 1 r1 v1 1 7\n", *from, LinkTime(1_500), |_| true).is_some());
+        let heard = sources.filter(|from| {
+            beacons.take_in(b"midshift-beacon 1 r1 v1 1 7\n", *from, LinkTime(1_500), |_| true).is_some()
+        });
         assert_eq!(heard.count(), limits::BEACON_SOURCES_MAX - 1, "sources of one second are counted too");
-        assert_eq!(ear.state().heard.len(), 1);
+        assert_eq!(beacons.state().heard.len(), 1);
     }
 
     #[test]
     fn the_table_of_robots_has_an_end_and_makes_room_of_what_is_old() {
-        let ear = Ear::default();
+        let beacons = BeaconListener::default();
         let take = |n: usize, ms: u64| {
             let text = format!("midshift-beacon 1 r{n} v1 1 7\n");
-            ear.take_in(text.as_bytes(), IpAddr::V4((n as u32 % 1_000).into()), LinkTime(ms), |_| true).is_some()
+            beacons.take_in(text.as_bytes(), IpAddr::V4((n as u32 % 1_000).into()), LinkTime(ms), |_| true).is_some()
         };
         assert!((0..limits::BEACONS_MAX).all(|n| take(n, 1_000 + n as u64 / 5)));
         let full = 1_000 + limits::BEACONS_MAX as u64 / 5;
         assert!(!take(limits::BEACONS_MAX, full), "all of them are fresh");
         assert!(take(limits::BEACONS_MAX, full + 10_000));
-        assert_eq!(ear.state().heard.len(), 1);
+        assert_eq!(beacons.state().heard.len(), 1);
     }
 }

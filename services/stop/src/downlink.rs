@@ -34,6 +34,6 @@ impl Stream for Down {
     type Item = Result<Bytes, Status>;
 
     fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        self.outbox.poll_next(&self.inner.law, &self.inner.key, cx)
+        self.outbox.poll_next(&self.inner.engaged_stops, &self.inner.key, cx)
     }
 }

@@ -65,7 +65,7 @@ pub struct Resetting {
 }
 
 /// The latch at work.
-pub struct Law {
+pub struct EngagedStops {
     latch: Latch,
     generation: u64,
     since: BTreeMap<StopId, u64>,
@@ -75,7 +75,7 @@ pub struct Law {
     everything: Option<Arc<[Bytes]>>,
 }
 
-impl Law {
+impl EngagedStops {
     /// With what was kept. Generations go on rising, also if the last of them were not kept.
     pub fn begin(kept: Kept, now: Utc) -> Self {
         let generation = now.0.max(0).cast_unsigned().max(kept.generation + 1);
@@ -264,75 +264,77 @@ mod tests {
 
     #[test]
     fn a_reset_counts_after_the_turn_of_the_disk_and_what_is_kept_has_it_before() {
-        let mut law = Law::begin(Kept::default(), Utc(1_000));
-        let id = law.draw(Utc(0));
-        law.engage(stop(id.clone(), Scope::Fleet), None).unwrap();
-        let resetting = law.reset(reset(&id));
-        assert!(resetting.was_engaged && law.latch().is_effective(&id), "robots still obey it");
-        assert!(!law.kept(Tail::default()).latch.is_effective(&id));
-        assert!(law.settle(resetting.version - 1, Utc(2)).is_empty());
-        assert_eq!(law.settle(resetting.version, Utc(2)), [(reset(&id), law.generation())]);
-        assert!(!law.latch().is_effective(&id));
-        let again = law.reset(Reset { reason: "again".to_owned(), ..reset(&id) });
+        let mut engaged_stops = EngagedStops::begin(Kept::default(), Utc(1_000));
+        let id = engaged_stops.draw(Utc(0));
+        engaged_stops.engage(stop(id.clone(), Scope::Fleet), None).unwrap();
+        let resetting = engaged_stops.reset(reset(&id));
+        assert!(resetting.was_engaged && engaged_stops.latch().is_effective(&id), "robots still obey it");
+        assert!(!engaged_stops.kept(Tail::default()).latch.is_effective(&id));
+        assert!(engaged_stops.settle(resetting.version - 1, Utc(2)).is_empty());
+        assert_eq!(engaged_stops.settle(resetting.version, Utc(2)), [(reset(&id), engaged_stops.generation())]);
+        assert!(!engaged_stops.latch().is_effective(&id));
+        let again = engaged_stops.reset(Reset { reason: "again".to_owned(), ..reset(&id) });
         assert_eq!((again.was_engaged, again.is_new, again.reset.reason.as_str()), (false, false, "over"));
     }
 
     #[test]
     fn what_was_reset_long_ago_goes_by_itself_and_what_is_kept_is_another_then() {
-        let mut law = Law::begin(Kept::default(), Utc(0));
-        let (old, engaged) = (law.draw(Utc(0)), law.draw(Utc(0)));
+        let mut engaged_stops = EngagedStops::begin(Kept::default(), Utc(0));
+        let (old, engaged) = (engaged_stops.draw(Utc(0)), engaged_stops.draw(Utc(0)));
         let asked = Asked { stop_id: old.clone(), hash: String::new(), at: Utc(1) };
-        law.engage(stop(old.clone(), Scope::Fleet), Some((RequestId::parse("once").unwrap(), asked))).unwrap();
-        law.engage(stop(engaged.clone(), Scope::Fleet), None).unwrap();
-        let resetting = law.reset(reset(&old));
-        law.settle(resetting.version, Utc(2));
-        let (version, age) = (law.version(), limits::RESETS_KEPT.as_ms());
-        law.forget(Utc(2).plus_ms(age));
-        assert_eq!(law.version(), version, "nothing is old yet");
-        law.forget(Utc(3).plus_ms(age));
-        assert_eq!(law.version(), version + 1);
-        let kept = law.kept(Tail::default());
+        engaged_stops
+            .engage(stop(old.clone(), Scope::Fleet), Some((RequestId::parse("once").unwrap(), asked)))
+            .unwrap();
+        engaged_stops.engage(stop(engaged.clone(), Scope::Fleet), None).unwrap();
+        let resetting = engaged_stops.reset(reset(&old));
+        engaged_stops.settle(resetting.version, Utc(2));
+        let (version, age) = (engaged_stops.version(), limits::RESETS_KEPT.as_ms());
+        engaged_stops.forget(Utc(2).plus_ms(age));
+        assert_eq!(engaged_stops.version(), version, "nothing is old yet");
+        engaged_stops.forget(Utc(3).plus_ms(age));
+        assert_eq!(engaged_stops.version(), version + 1);
+        let kept = engaged_stops.kept(Tail::default());
         assert!(kept.latch.stop(&old).is_none() && kept.requests.is_empty(), "{kept:?}");
         assert!(kept.latch.is_effective(&engaged), "what is engaged has no age");
     }
 
     #[test]
     fn generations_rise_over_restarts_whatever_the_wall_says() {
-        let law = Law::begin(Kept { generation: 5_000, ..Kept::default() }, Utc(1_000));
-        assert_eq!(law.generation(), 5_001);
-        assert_eq!(Law::begin(Kept::default(), Utc(1_000)).generation(), 1_000);
+        let engaged_stops = EngagedStops::begin(Kept { generation: 5_000, ..Kept::default() }, Utc(1_000));
+        assert_eq!(engaged_stops.generation(), 5_001);
+        assert_eq!(EngagedStops::begin(Kept::default(), Utc(1_000)).generation(), 1_000);
     }
 
     #[test]
     fn the_last_stops_are_kept_for_the_fleet_and_the_refusal_says_so() {
-        let mut law = Law::begin(Kept::default(), Utc(0));
+        let mut engaged_stops = EngagedStops::begin(Kept::default(), Utc(0));
         let robot = Scope::Robot(RobotId::parse("r1").unwrap());
         let halt = StopLevel::Halt;
         for _ in 0..limits::STOPS_MAX - limits::STOPS_FOR_FLEET {
-            law.room(&robot, halt).unwrap();
-            let id = law.draw(Utc(0));
-            law.engage(stop(id, robot.clone()), None).unwrap();
+            engaged_stops.room(&robot, halt).unwrap();
+            let id = engaged_stops.draw(Utc(0));
+            engaged_stops.engage(stop(id, robot.clone()), None).unwrap();
         }
-        let refusal = law.room(&robot, halt).unwrap_err();
+        let refusal = engaged_stops.room(&robot, halt).unwrap_err();
         assert_eq!((refusal.kind(), refusal.reason.code), (Kind::Exhausted, Code::StopsFull));
         assert!(refusal.reason.text().contains("engage the fleet"), "{refusal}");
         for _ in 0..limits::STOPS_FOR_FLEET {
-            law.room(&Scope::Fleet, halt).unwrap();
-            let id = law.draw(Utc(0));
-            law.engage(stop(id, Scope::Fleet), None).unwrap();
+            engaged_stops.room(&Scope::Fleet, halt).unwrap();
+            let id = engaged_stops.draw(Utc(0));
+            engaged_stops.engage(stop(id, Scope::Fleet), None).unwrap();
         }
-        let refusal = law.room(&Scope::Fleet, halt).unwrap_err();
+        let refusal = engaged_stops.room(&Scope::Fleet, halt).unwrap_err();
         assert!(refusal.reason.text().contains("stopped already"), "{refusal}");
     }
 
     #[test]
     fn whoever_fills_the_latch_with_slow_ones_keeps_nobody_from_halting_the_fleet() {
-        let mut law = Law::begin(Kept::default(), Utc(0));
+        let mut engaged_stops = EngagedStops::begin(Kept::default(), Utc(0));
         let mut engage = |level, times: usize| {
             (0..times).find_map(|_| {
-                law.room(&Scope::Fleet, level).err().or_else(|| {
-                    let id = law.draw(Utc(0));
-                    law.engage(Stop { level, ..stop(id, Scope::Fleet) }, None).unwrap();
+                engaged_stops.room(&Scope::Fleet, level).err().or_else(|| {
+                    let id = engaged_stops.draw(Utc(0));
+                    engaged_stops.engage(Stop { level, ..stop(id, Scope::Fleet) }, None).unwrap();
                     None
                 })
             })
@@ -341,7 +343,7 @@ mod tests {
         assert!(engage(StopLevel::Slow, 1).is_some(), "the fleet is slow already");
         assert!(engage(StopLevel::Halt, 1).is_none() && engage(StopLevel::Halt, 1).is_some());
         assert!(engage(StopLevel::ControlledStopPosture, 1).is_none() && engage(StopLevel::Halt, 1).is_some());
-        assert_eq!(law.latch().effective().count(), limits::STOPS_MAX + 2);
+        assert_eq!(engaged_stops.latch().effective().count(), limits::STOPS_MAX + 2);
     }
 
     #[test]
