@@ -70,7 +70,7 @@ const MADE: [&str; 16] = [
 const MANY: &[(&str, &[Table])] = &[
     ("audit/chain", &[Table::TaskAudit, Table::FleetAudit, Table::OtaAudit, Table::StopAudit, Table::IdentityAudit]),
     ("lead", &[Table::FleetLeader, Table::OtaLeader]),
-    ("once", &[Table::CommandKey, Table::OtaCommandKey]),
+    ("idempotency", &[Table::CommandKey, Table::OtaCommandKey]),
 ];
 
 /// Words of a name in camel or snake case, in lower case.
