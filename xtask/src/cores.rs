@@ -8,7 +8,7 @@ pub const WINDOW: Duration = Duration::from_secs(2);
 /// What the cores did since the last look.
 pub struct Cores {
     since: Instant,
-    /// None where the system counts nothing.
+    /// None where the system counts nothing, or other cores.
     counted: Option<Counted>,
 }
 
@@ -39,11 +39,18 @@ impl Cores {
 
 impl Counted {
     fn now() -> Option<Self> {
-        Self::read(&std::fs::read_to_string("/proc/stat").ok()?)
+        let cores = std::thread::available_parallelism().ok()?.get();
+        Self::read(&std::fs::read_to_string("/proc/stat").ok()?, cores)
     }
 
-    /// The first line of /proc/stat, as proc(5) has it: user, nice, system, idle, iowait, …
-    fn read(text: &str) -> Option<Self> {
+    /// The first line of /proc/stat, as proc(5) has it: user, nice, system, idle, iowait, … None if it counts other cores than the `cores` that
+    /// this process may use: those of the host of a container are idle while its own are full.
+    fn read(text: &str, cores: usize) -> Option<Self> {
+        let is_core =
+            |line: &&str| line.strip_prefix("cpu").is_some_and(|rest| rest.starts_with(|c: char| c.is_ascii_digit()));
+        if text.lines().filter(is_core).count() != cores {
+            return None;
+        }
         let ticks = text.lines().next()?.strip_prefix("cpu ")?.split_whitespace().map(str::parse);
         let ticks: Vec<u64> = ticks.take(8).collect::<Result<_, _>>().ok()?;
         Some(Self { all: ticks.iter().sum(), idle: *ticks.get(3)? })
@@ -60,17 +67,23 @@ mod tests {
 
     #[test]
     fn cores_that_wait_for_a_disk_are_not_idle() {
-        let counted = |text| Counted::read(text).unwrap();
-        let before = counted("cpu  100 0 100 1000 50 0 0 0 0 0\ncpu0 1 1 1 1");
+        let counted = |text| Counted::read(&format!("{text}\ncpu0 1 1 1 1\ncpu1 1 1 1 1\nintr 7"), 2).unwrap();
+        let before = counted("cpu  100 0 100 1000 50 0 0 0 0 0");
         assert_eq!(before, Counted { all: 1250, idle: 1000 });
         assert!(counted("cpu  120 0 120 1050 60 0 0 0 0 0").is_idle_since(before));
         assert!(!counted("cpu  120 0 120 1040 70 0 0 0 0 0").is_idle_since(before));
-        assert_eq!([Counted::read(""), Counted::read("cpu  1 2"), Counted::read("cpu  a b c d")], [None; 3]);
+        assert_eq!([Counted::read("", 0), Counted::read("cpu  1 2", 0), Counted::read("cpu  a b c d", 0)], [None; 3]);
+    }
+
+    #[test]
+    fn cores_of_a_host_say_nothing_of_those_that_a_container_may_use() {
+        let host = "cpu  1 2 3 4 5\ncpu0 1 1 1 1\ncpu1 1 1 1 1\ncpu2 1 1 1 1";
+        assert_eq!(Counted::read(host, 2), None);
+        assert_eq!(Counted::read(host, 3), Some(Counted { all: 15, idle: 4 }));
     }
 
     #[test]
     fn a_look_that_comes_too_early_says_no() {
         assert!(!Cores::new().are_idle());
-        assert!(Counted::now().is_some(), "this system counts");
     }
 }
