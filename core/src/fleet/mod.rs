@@ -51,10 +51,10 @@ use decision::plan::mark;
 use explanation::{lasting, unexplained};
 use facts::{misreads, sweep};
 use maintenance::{budget, drain};
-use projection::rows::{RobotAuthority, RobotControl, RobotHolder, ServiceClock, SiteRow};
+use projection::rows::{Place, RobotAuthority, RobotControl, RobotHolder, ServiceClock, SiteRow};
 use projection::state::FleetProjection;
 use tasks::arrivals;
-use traffic::{closures, desired, places};
+use traffic::{closures, desired, serve};
 
 /// Who else may plan on a store that other processes open too, or not.
 pub fn rivals(is_shared: bool, bugs: bugs::Bugs) -> Rivals {
@@ -89,7 +89,7 @@ pub fn found(view: &mut FleetProjection, now: Now, site_text: &str, map: &maps::
                     continue;
                 }
                 let known = tx.view.places.get(place.place_id.as_str()).map(|p| p.row.clone());
-                let fresh = places::fresh(place);
+                let fresh = Place::unheld(place);
                 let row = known.map_or(fresh.clone(), |k| rows::Place {
                     capacity: fresh.capacity,
                     standing: fresh.standing,
@@ -152,7 +152,7 @@ pub fn cycle(view: &mut FleetProjection, now: Now, board: &Board, pace: Pace, pl
     errands::plan(view, board, now, idle, plan);
     plan.slice.renew();
     write_down(view, now, board, &desired::Releases::default(), plan);
-    let releases = places::advance(view, board, now, plan);
+    let releases = serve::serve_requests(view, board, now, plan);
     plan.slice.renew();
     write_down(view, now, board, &releases, plan);
     if pace == Pace::Sweep {

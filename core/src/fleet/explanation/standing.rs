@@ -14,7 +14,7 @@ use crate::fleet::projection::queue::Wait;
 use crate::fleet::projection::rows::{Place, RobotHolder};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::{claims, eligibility, plausible};
-use crate::fleet::traffic::{closures, engaged_stops, places, starts};
+use crate::fleet::traffic::{closures, engaged_stops, grants, route_requests, starts};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::{Code, Reason};
 use crate::robot::{Mode, Presence, WorkState};
@@ -116,7 +116,11 @@ pub fn of_attempt(view: &FleetProjection, board: &Board, now: &Now, a: &Attempt)
         // The heartbeat is older than what the robot said since as events, of which the row knows.
         (_, None) if !liveness::is_fresh(view, live) => Some(works(view, now, a, live, a.step_index)),
         (_, None) => Some(Reason::from(Code::RobotReconciling).with(WAITS_FOR, robot)),
-        (_, Some(listed)) if listed.state == WorkState::Navigating && places::is_out_of_route(view, live, a) => None,
+        (_, Some(listed))
+            if listed.state == WorkState::Navigating && route_requests::is_out_of_route(view, live, a) =>
+        {
+            None
+        }
         (_, Some(_)) if view.bugs.steps_are_not_told() => None,
         (_, Some(listed)) => Some(works(view, now, a, live, listed.step_index)),
     }
@@ -307,7 +311,7 @@ fn in_the_way(
     let wants = |other: &PlaceId| places.contains(other);
     let earlier = view.waits.iter().filter(|(_, w)| w.since <= mine && w.places.iter().any(wants)).map(|(id, _)| id);
     let areas = known().filter_map(|ix| view.site.place(ix).waypoint()).map(|at| &view.site.area_of(at).area_id);
-    let inside: BTreeSet<RobotId> = areas.flat_map(|area| places::robots_in_area(view, area)).collect();
+    let inside: BTreeSet<RobotId> = areas.flat_map(|area| grants::robots_in_area(view, area)).collect();
     let closed = engaged_stops::closed(view);
     let has_seat = |p: &Place| {
         let known = view.site.find_place(&p.place_id);

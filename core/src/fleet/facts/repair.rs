@@ -13,7 +13,7 @@ use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::claims::{PLACES, differences, excess, implausible};
 use crate::fleet::tasks::transitions::{self, News, happen, may_suspend};
 use crate::fleet::tasks::{arrivals, errand_reports, load, plausible};
-use crate::fleet::traffic::{places, routing};
+use crate::fleet::traffic::{route_requests, routing};
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -269,7 +269,7 @@ fn stalled(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     let uncertain = tx.view.held_by(robot_id).and_then(|a| tx.view.attempt(a)).is_some_and(|a| a.uncertain.is_some());
     let accepted = tx.view.held_by(robot_id).and_then(|a| tx.view.attempt(a)).and_then(|a| a.accepted);
     let young = accepted.is_none_or(|at| tx.now.ms_since(at) <= intake.spec.stall_ms);
-    let excused = places::waits(tx.view, robot_id)
+    let excused = route_requests::waits(tx.view, robot_id)
         || live.report.mode != Mode::Automatic
         || live.report.hardware_stop != HardwareStop::None
         || task.phase != Phase::Running

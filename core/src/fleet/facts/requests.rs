@@ -6,7 +6,7 @@ use crate::fleet::decision::plan::{Plan, Tx, mark};
 use crate::fleet::projection::rows::HoldToken;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::transitions::{News, happen};
-use crate::fleet::traffic::places;
+use crate::fleet::traffic::grants;
 use crate::ids::{AreaId, RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -125,7 +125,7 @@ fn resumes(
     };
     // A stop that is named alone means everywhere; the service refuses a request that names nothing.
     let anywhere = area_id.is_none() && task_ids.is_empty() && robot_ids.is_empty();
-    let area_robots = area_id.map(|area| places::robots_in_area(view, area)).unwrap_or_default();
+    let area_robots = area_id.map(|area| grants::robots_in_area(view, area)).unwrap_or_default();
     let near = |robot: &RobotId| anywhere || robot_ids.contains(robot) || area_robots.contains(robot);
     let works_on = |robot: &RobotId| {
         view.held_by(robot).and_then(|a| a.subject.task_id()).is_some_and(|task| task_ids.contains(task))

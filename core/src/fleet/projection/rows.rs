@@ -57,6 +57,18 @@ pub struct Place {
 }
 
 impl Place {
+    /// The row of a place that nobody has ever held.
+    pub fn unheld(place: &crate::site::Place) -> Self {
+        Self {
+            place_id: place.place_id.clone(),
+            capacity: place.capacity,
+            standing: place.waypoint().is_some(),
+            holders: Vec::new(),
+            quarantine: None,
+            cleared: Vec::new(),
+        }
+    }
+
     /// Whether a holder that nobody knows anything of closes all of its seats.
     pub fn is_closed_whole_by(&self, holder: &PlaceHolder) -> bool {
         self.capacity <= 1 || holder.state == HolderState::Inside

@@ -2,7 +2,7 @@
 
 use super::Rig;
 use crate::fleet::rows::{HolderState, Incident, Place, PlaceHolder};
-use crate::fleet::traffic::{closures, places};
+use crate::fleet::traffic::closures;
 use crate::fleet::{Pace, Plan, incidents};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::Code;
@@ -18,7 +18,7 @@ fn silent(state: HolderState) -> Rig {
     let attempt = &mut rig.view.attempts.get_mut(&id).expect("a row").row;
     (attempt.phase, attempt.ended) = (AttemptPhase::Lost, Some(rig.now.utc));
     let ix = rig.view.site.find_place(&wait_a()).expect("a place");
-    let mut place = places::fresh(rig.view.site.place(ix));
+    let mut place = Place::unheld(rig.view.site.place(ix));
     let (robot_id, since) = (RobotId::parse("r1").expect("an id"), rig.now.utc);
     place.holders.push(PlaceHolder { robot_id, grant_id: 7, state, since, claimed: false });
     Plan::default().decide(&mut rig.view, rig.now, "fleet", |tx| tx.put_row(place, "place.granted"));

@@ -1,9 +1,8 @@
 //! Several incidents at one moment, and as many as one robot's words open.
 
 use super::Rig;
-use crate::fleet::rows::{HolderState, PlaceHolder};
+use crate::fleet::rows::{HolderState, Place, PlaceHolder};
 use crate::fleet::tasks::claims;
-use crate::fleet::traffic::places;
 use crate::fleet::{Plan, incidents};
 use crate::ids::{PlaceId, RobotId};
 use crate::limits::{CROWD_NAMED_MAX, INCIDENTS_OF_ROBOT_MAX};
@@ -54,7 +53,7 @@ fn robots_that_crowd_one_place_are_one_incident_that_names_a_few_and_counts_all(
     let (mut rig, mut plan) = (Rig::new(), Plan::default());
     let place_id = PlaceId::parse("park-a").expect("an id");
     let ix = rig.view.site.find_place(&place_id).expect("a place");
-    let mut place = places::fresh(rig.view.site.place(ix));
+    let mut place = Place::unheld(rig.view.site.place(ix));
     let second = rig.now.utc.plus_ms(1_000);
     for n in 1..=31 {
         let robot_id = RobotId::parse(&format!("r{n}")).expect("an id");

@@ -2,7 +2,7 @@
 //!
 //! Invariant: such a place counts as taken for every other robot: no grant, no errand, no seat of its area. It is no row, so nothing is ever
 //! given back: a robot is awaited until its first settled heartbeat was compared with the rows, which then say where it stands.
-//! Called by `places`, by errands and by the explanations.
+//! Called by `grants`, by errands and by the explanations.
 
 use crate::fleet::projection::rows::Place;
 use crate::fleet::projection::state::FleetProjection;

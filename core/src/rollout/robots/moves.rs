@@ -52,7 +52,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
                 _ if r.grant.is_some() => ReleasedBy::Reported,
                 _ => unpermitted(&r),
             };
-            leave_drain(tx, &mut r, released_by);
+            release_drain(tx, &mut r, released_by);
             write_step(tx, r, to, "robot.skipped");
         }
         Move::Again => {
@@ -105,7 +105,7 @@ pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
                 r.failure = r.failure.filter(|f| f.code != Code::RobotLost);
             }
             r.attempted = true;
-            leave_drain(tx, &mut r, ReleasedBy::Reported);
+            release_drain(tx, &mut r, ReleasedBy::Reported);
             write_step(tx, r, to, "robot.on_trial");
         }
         Move::Fail(why) => fail(tx, &r, why),
@@ -251,7 +251,7 @@ fn roll_back(tx: &mut Tx, rollout: &Rollout, mut r: RolloutRobot, to: Step, why:
     }
     let back = if asked && r.failure.is_none() { Code::RevertAsked.into() } else { why };
     r.why = Some(rollout.abort.as_ref().map_or(back, |a| a.reason.clone()));
-    leave_drain(tx, &mut r, ReleasedBy::Reported);
+    release_drain(tx, &mut r, ReleasedBy::Reported);
     write_step(tx, r, to, "robot.rolled_back");
     ending::reconsider_ending(tx, &rollout.rollout_id);
 }
@@ -377,7 +377,7 @@ fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool)
     }
 }
 
-fn leave_drain(tx: &mut Tx, r: &mut RolloutRobot, why: ReleasedBy) {
+fn release_drain(tx: &mut Tx, r: &mut RolloutRobot, why: ReleasedBy) {
     let Some(drain_id) = r.drain_id.take() else { return };
     (r.ready, r.grant) = (false, None);
     tx.put_row(DrainRelease { drain_id, why }, "drain.release");
@@ -425,7 +425,7 @@ fn give_up_drain(tx: &mut Tx, mut r: RolloutRobot, to: Step) {
         change_desired(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Stage, None, None));
     }
     let released_by = unpermitted(&r);
-    leave_drain(tx, &mut r, released_by);
+    release_drain(tx, &mut r, released_by);
     write_step(tx, r, to, "robot.drain_left");
 }
 
