@@ -273,7 +273,7 @@ impl Folder {
             copy(&bundle.join(&file.name), &self.file(&file.name, file.digest))?;
         }
         files.extend(ways);
-        Ok((manifest, self.publish(&sign_targets(previous.as_deref(), &files, &[], expires, keys)?)?))
+        Ok((manifest, self.store_signed(&sign_targets(previous.as_deref(), &files, &[], expires, keys)?)?))
     }
 
     /// Signs a targets document that lists a bundle no more, nor files that only it has. The files stay in this folder: the document
@@ -300,7 +300,7 @@ impl Folder {
         let known = previous.as_deref().map(listed).transpose()?.unwrap_or_default();
         gone.extend(ways_to(&lost, &known).map(str::to_owned));
         let signed = sign_targets(previous.as_deref(), &[], &gone, now.plus_ms(PEOPLE_LIFE_MS), keys)?;
-        Ok((withdrawn, self.publish(&signed)?))
+        Ok((withdrawn, self.store_signed(&signed)?))
     }
 
     /// Adds a set of keys that sign directives, as `bundle rekey` made it, and signs the targets document that lists it.
@@ -328,7 +328,7 @@ impl Folder {
         let signed = sign_targets(previous.as_deref(), add, &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?;
         let path = self.file(&file.name, file.digest);
         midshift_durable::replace(&path, envelope).map_err(io("writing", &path))?;
-        Ok((set, self.publish(&signed)?))
+        Ok((set, self.store_signed(&signed)?))
     }
 
     /// Signs the newest targets document anew, with the next number and a year of its own: after a root that changes who signs, or when it ends.
@@ -340,7 +340,7 @@ impl Folder {
         let Some((_, previous)) = self.newest("targets")? else {
             return Err(Refusal::field("repository", "no targets document was signed yet").into());
         };
-        self.publish(&sign_targets(Some(&previous), &[], &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?)
+        self.store_signed(&sign_targets(Some(&previous), &[], &[], now.plus_ms(PEOPLE_LIFE_MS), keys)?)
     }
 
     /// No document waits, and each of `keys` is asked for.
@@ -373,10 +373,10 @@ impl Folder {
         for handed in handed {
             document = merge_targets(&document, handed, &asked)?;
         }
-        self.publish(&add_signatures(&document, keys)?)
+        self.store_signed(&add_signatures(&document, keys)?)
     }
 
-    fn publish(&self, document: &[u8]) -> Result<Signed, Error> {
+    fn store_signed(&self, document: &[u8]) -> Result<Signed, Error> {
         if check_targets(&self.root()?.1, document).is_err() {
             self.write(PENDING, document)?;
             return Ok(Signed::Pending);

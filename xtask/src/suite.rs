@@ -9,7 +9,7 @@ use crate::round::{Count, Round, Scope};
 use crate::run::{self, timed};
 use crate::workspace::Workspace;
 use crate::{deny, docker, sweep};
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use clap::{Args, ValueEnum};
 use std::time::Duration;
 
@@ -52,6 +52,7 @@ pub fn test(workspace: &Workspace, asked: &Asked) -> Result<bool> {
         parts.retain(|part| *part != Part::Compose);
         run::tell_person("--no-docker: the part `compose` is left out");
     }
+    ensure!(asked.only.is_empty() || parts.contains(&Part::E2e), "--only chooses tests of the part `e2e`: name it too");
     let (mut lines, mut count) = (Vec::new(), Count::default());
     let mut round = Round { workspace, tools: None, scope, only: &asked.only };
     if parts.iter().any(|part| part.needs_tools()) {

@@ -1,6 +1,6 @@
 //! The newest heartbeat of each robot, where several processes must know it: gateways keep it, everybody reads what is new.
 //!
-//! Invariant: what [`HeardLog::append`] has answered is what every later reader sees, and an item with
+//! Invariant: what [`HeardLog::keep_newest`] has answered is what every later reader sees, and an item with
 //! [`midshift_core::rows::Silent`] is applied only if nothing of its robot was kept after the position that it names. So whoever
 //! gives a robot's work to another knows everything that the robot relies on. Bodies are not decoded here.
 //!
@@ -33,7 +33,7 @@ pub struct Heard {
     pub body: Arc<str>,
 }
 
-/// What became of a call of [`HeardLog::append`].
+/// What became of a call of [`HeardLog::keep_newest`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Kept {
     /// Newest number of the store's feed at that moment: what was decided before is up to here.
@@ -46,7 +46,7 @@ pub struct Kept {
 #[async_trait]
 pub trait HeardLog: Send + Sync + 'static {
     /// Keeps heartbeats of different robots, each unless a newer session of its robot was heard; durable on return.
-    async fn append(&self, heard: Vec<Heard>) -> Result<Kept, Error>;
+    async fn keep_newest(&self, heard: Vec<Heard>) -> Result<Kept, Error>;
     /// The newest position; 0: nothing was ever kept.
     async fn position(&self) -> Result<u64, Error>;
     /// Robots heard after a position, each with its newest, and the position read up to.
@@ -124,7 +124,7 @@ impl MemoryHeard {
 
 #[async_trait]
 impl HeardLog for MemoryHeard {
-    async fn append(&self, heard: Vec<Heard>) -> Result<Kept, Error> {
+    async fn keep_newest(&self, heard: Vec<Heard>) -> Result<Kept, Error> {
         let mut fenced = Vec::new();
         {
             let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);

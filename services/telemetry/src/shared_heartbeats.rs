@@ -124,7 +124,7 @@ async fn write(log: &dyn HeardLog, batch: &BTreeMap<RobotId, Waiting>) -> Result
         return log.position().await.map(|_| None);
     }
     let begun = Instant::now();
-    let kept = log.append(batch.values().map(|waiting| Heard::from(waiting.live.as_ref())).collect()).await?;
+    let kept = log.keep_newest(batch.values().map(|waiting| Heard::from(waiting.live.as_ref())).collect()).await?;
     metrics::histogram!("midshift_telemetry_heartbeat_commit_seconds").record(begun.elapsed().as_secs_f64());
     Ok(Some(kept))
 }

@@ -13,7 +13,7 @@ use midshift_sim::journal::{self, Effect};
 use std::collections::BTreeSet;
 
 const ROBOTS: usize = 6;
-const TASKS: usize = 40;
+const TASKS: usize = 60;
 /// The release that all of them take, and the one that none keeps.
 const GOOD: &str = "1.5.0";
 const BAD: &str = "1.6.0-bad-at-start";
@@ -47,6 +47,8 @@ async fn a_fleet_takes_a_release_in_the_middle_of_a_shift_and_loses_no_task_thou
     until("the canary keeps it on trial", LIMIT, async || Ok(robots.iter().any(Robot::is_on_trial).then_some(())))
         .await?;
     server.kill_and_restart().await?;
+    // The shift is not over yet.
+    at_work(server.address, 2, &BTreeSet::new()).await?;
     let waited = ended(GOOD)?;
     ensure!(waited.status.code() == Some(0), "{}", String::from_utf8_lossy(&waited.stderr));
     for robot in &robots {

@@ -16,7 +16,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 const ROBOTS: usize = 4;
-const TASKS: usize = 16;
+const TASKS: usize = 24;
 /// Bad with a load, so that it is still on probation when somebody stops the fleet.
 const BAD: &str = "1.6.2-bad-with-load";
 

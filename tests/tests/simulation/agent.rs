@@ -81,7 +81,7 @@ impl Agent {
             let life = self.lives.fetch_add(1, Relaxed);
             self.observer.lock().restarted(self.body.robot_id());
             let start = self.launched.start(&self.body, self.time.site())?;
-            self.send_status()?;
+            self.note_start()?;
             let Start::Runs { hangs_after } = start else {
                 self.observer.lock().count("program died at its start");
                 pause = self.launched.pause();
@@ -101,7 +101,7 @@ impl Agent {
     }
 
     /// The witness looks at what is started.
-    fn send_status(&self) -> anyhow::Result<()> {
+    fn note_start(&self) -> anyhow::Result<()> {
         let holdings = self.launched.holdings()?;
         let running = holdings.set(holdings.switch.running());
         self.observer.starts(self.body.robot_id(), &holdings.switch, running.as_ref());

@@ -160,7 +160,7 @@ impl Game {
         while self.room.now_ms() < play_ms {
             let round_ms = (self.room.now_ms() + LOOK_MS).min(play_ms);
             self.room.until("one round of the game", 2 * LOOK_MS, |room| room.now_ms() >= round_ms)?;
-            self.check_robots();
+            self.check_laws();
         }
         for number in 0..self.players.len() {
             self.room.sim.crash(player_machine(number));
@@ -182,7 +182,7 @@ impl Game {
                 is_over = room.desk.is_empty() && all_over;
                 is_over || room.now_ms() >= round_ms
             })?;
-            self.check_robots();
+            self.check_laws();
             if is_over {
                 return Ok(());
             }
@@ -269,7 +269,7 @@ impl Game {
     }
 
     /// Laws of a moment.
-    fn check_robots(&mut self) {
+    fn check_laws(&mut self) {
         let metrics = counted();
         let drops = midshift_sim::world::lock(&self.room.hall.worlds()[0]).judge().drops_by_task();
         let mut seen = self.room.observer.lock();

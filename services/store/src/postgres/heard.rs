@@ -63,7 +63,7 @@ impl PostgresHeard {
 
 #[async_trait]
 impl HeardLog for PostgresHeard {
-    async fn append(&self, heard: Vec<Heard>) -> Result<Kept, Error> {
+    async fn keep_newest(&self, heard: Vec<Heard>) -> Result<Kept, Error> {
         let mut writer = self.writer.lock().await;
         let mut attempt = 0;
         loop {

@@ -84,7 +84,7 @@ pub async fn used() -> PostgresConfig {
         .await
         .unwrap();
     let heard = Heard { robot_id: robot(), session_epoch: 1, hb: 2, body: Arc::from("{}") };
-    PostgresHeard::open(&config, site()).await.unwrap().append(vec![heard]).await.unwrap();
+    PostgresHeard::open(&config, site()).await.unwrap().keep_newest(vec![heard]).await.unwrap();
     config
 }
 
@@ -113,7 +113,7 @@ async fn a_database_made_of_a_copy_has_the_same_rows_and_goes_on_above_them_as_a
     assert_eq!(positions, [first, first + 1]);
     let heard = PostgresHeard::open(&to, site()).await.unwrap();
     let position = heard.position().await.unwrap();
-    heard.append(vec![Heard { robot_id: robot(), session_epoch: 1, hb: 3, body: Arc::from("{}") }]).await.unwrap();
+    heard.keep_newest(vec![Heard { robot_id: robot(), session_epoch: 1, hb: 3, body: Arc::from("{}") }]).await.unwrap();
     assert_eq!((position, heard.position().await.unwrap()), (1, 2));
 }
 

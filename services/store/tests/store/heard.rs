@@ -24,7 +24,7 @@ fn heard(id: &str, session_epoch: u64, hb: u64) -> Heard {
 async fn contract(store: Arc<dyn Store>, log: &dyn HeardLog) {
     assert_eq!(log.position().await.unwrap(), 0);
     assert_eq!(log.read(0).await.unwrap(), (Vec::new(), 0));
-    let kept = log.append(vec![heard("a", 2, 1), heard("b", 1, 7)]).await.unwrap();
+    let kept = log.keep_newest(vec![heard("a", 2, 1), heard("b", 1, 7)]).await.unwrap();
     assert_eq!(kept.fenced, []);
     let first = log.position().await.unwrap();
     let (mut all, read) = log.read(0).await.unwrap();
@@ -32,17 +32,17 @@ async fn contract(store: Arc<dyn Store>, log: &dyn HeardLog) {
     assert_eq!((all, read), (vec![heard("a", 2, 1), heard("b", 1, 7)], first));
     assert_eq!(log.read(read).await.unwrap(), (Vec::new(), read));
     // Of an older session nothing is kept; others of the batch are.
-    let kept = log.append(vec![heard("a", 1, 99), heard("b", 1, 8)]).await.unwrap();
+    let kept = log.keep_newest(vec![heard("a", 1, 99), heard("b", 1, 8)]).await.unwrap();
     assert_eq!(kept.fenced, [robot("a")]);
     let (newer, read) = log.read(read).await.unwrap();
     assert_eq!(newer, [heard("b", 1, 8)]);
     // Whoever was away sees each robot once, with its newest.
-    log.append(vec![heard("a", 2, 2)]).await.unwrap();
-    log.append(vec![heard("a", 3, 1)]).await.unwrap();
+    log.keep_newest(vec![heard("a", 2, 2)]).await.unwrap();
+    log.keep_newest(vec![heard("a", 3, 1)]).await.unwrap();
     assert_eq!(log.read(read).await.unwrap().0, [heard("a", 3, 1)]);
     // What was decided before is up to the head that it tells.
     let decided = store.commit(vec![item(Writer::Fleet, vec![put(Table::Attempt, "x", Expect::Absent, "{}")])]).await;
-    let kept = log.append(vec![heard("a", 3, 2)]).await.unwrap();
+    let kept = log.keep_newest(vec![heard("a", 3, 2)]).await.unwrap();
     assert_eq!(kept.head, decided[0].as_ref().unwrap().seq);
 }
 
@@ -72,12 +72,12 @@ async fn what_relies_on_a_robots_silence_is_not_applied_once_it_was_heard_anywhe
     let store = postgres_at(&config).await;
     let log = PostgresHeard::open(&config, site()).await.unwrap();
     commit(&store, "never-heard", "a", 0).await.unwrap();
-    log.append(vec![heard("a", 1, 1)]).await.unwrap();
+    log.keep_newest(vec![heard("a", 1, 1)]).await.unwrap();
     let known = log.position().await.unwrap();
     commit(&store, "known", "a", known).await.unwrap();
-    log.append(vec![heard("b", 1, 1)]).await.unwrap();
+    log.keep_newest(vec![heard("b", 1, 1)]).await.unwrap();
     commit(&store, "another-robot", "a", known).await.unwrap();
-    log.append(vec![heard("a", 1, 2)]).await.unwrap();
+    log.keep_newest(vec![heard("a", 1, 2)]).await.unwrap();
     let refused = commit(&store, "heard", "a", known).await.expect_err("it was heard");
     assert!(matches!(refused, CommitError::Heard { robot_id } if robot_id == robot("a")));
 }
@@ -106,7 +106,7 @@ async fn a_heartbeat_waits_for_what_relies_on_silence_and_tells_how_far_decision
     say(&mut fleet, "BEGIN; SELECT seq FROM store_head WHERE site_id = 'north' FOR UPDATE").await;
     say(&mut fleet, "SELECT position FROM robot_last_head WHERE site_id = 'north' FOR SHARE").await;
     let keeping = log.clone();
-    let waiting = tokio::spawn(async move { keeping.append(vec![heard("a", 1, 1)]).await });
+    let waiting = tokio::spawn(async move { keeping.keep_newest(vec![heard("a", 1, 1)]).await });
     until_a_writer_waits(&mut fleet).await;
     say(&mut fleet, &format!("UPDATE store_head SET seq = {}; COMMIT", head + 5)).await;
     assert_eq!(waiting.await.unwrap().unwrap().head, Seq(head + 5));
@@ -122,7 +122,7 @@ async fn two_gateways_that_keep_at_once_are_read_without_a_hole() {
         let log = PostgresHeard::open(&config, site()).await.unwrap();
         tasks.spawn(async move {
             for hb in 1..=EACH {
-                assert_eq!(log.append(vec![heard(gateway, 1, hb)]).await.unwrap().fenced, []);
+                assert_eq!(log.keep_newest(vec![heard(gateway, 1, hb)]).await.unwrap().fenced, []);
             }
         });
     }
@@ -153,14 +153,14 @@ fn live(id: &str, hb: u64) -> Live {
 async fn what_a_gateway_keeps_comes_onto_the_boards_of_others_by_their_own_clocks() {
     let Bench { store, .. } = memory();
     let log: Arc<dyn HeardLog> = Arc::new(MemoryHeard::new(store));
-    log.append(vec![Heard::from(&live("old", 1))]).await.unwrap();
+    log.keep_newest(vec![Heard::from(&live("old", 1))]).await.unwrap();
     let board = LiveBoard::new();
     let following = tokio::spawn(follow_heard(log.clone(), board.clone(), clock()));
     let mut changed = board.changed();
     while board.read_up_to() == 0 {
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
-    log.append(vec![Heard::from(&live("a", 4))]).await.unwrap();
+    log.keep_newest(vec![Heard::from(&live("a", 4))]).await.unwrap();
     changed.changed().await.unwrap();
     let seen = board.get(&robot("a")).expect("it is on the board");
     assert_eq!((seen.report.hb, seen.received_unix_ms, seen.clock_offset_ms), (4, 5, Some((3, 1))));
@@ -168,7 +168,7 @@ async fn what_a_gateway_keeps_comes_onto_the_boards_of_others_by_their_own_clock
     assert!(board.get(&robot("old")).is_none(), "who was heard before is waited for");
     // What its own sessions put there is not replaced by what was read meanwhile.
     board.publish(&robot("a"), Arc::new(live("a", 9)));
-    log.append(vec![Heard::from(&live("a", 5)), Heard::from(&live("b", 1))]).await.unwrap();
+    log.keep_newest(vec![Heard::from(&live("a", 5)), Heard::from(&live("b", 1))]).await.unwrap();
     while board.get(&robot("b")).is_none() {
         changed.changed().await.unwrap();
     }

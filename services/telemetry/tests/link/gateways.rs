@@ -26,14 +26,14 @@ struct Wire {
 
 #[async_trait]
 impl HeardLog for Wire {
-    async fn append(&self, heard: Vec<Heard>) -> std::result::Result<Kept, Error> {
+    async fn keep_newest(&self, heard: Vec<Heard>) -> std::result::Result<Kept, Error> {
         self.reach()?;
         if self.decides.swap(false, Ordering::SeqCst) {
             let mut item = Item::new(Writer::Fleet, "fleet");
             item.put_row(&work(), Expect::Absent, "work.desired");
             assert!(self.store.commit(vec![item]).await.iter().all(std::result::Result::is_ok));
         }
-        self.log.append(heard).await
+        self.log.keep_newest(heard).await
     }
     async fn position(&self) -> std::result::Result<u64, Error> {
         self.reach()?;
