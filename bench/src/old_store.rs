@@ -10,7 +10,6 @@ use crate::grid_map;
 use crate::offer::{Idle, one};
 use crate::submit::transports;
 use anyhow::{Context, ensure};
-use midshift::storage::Database;
 use midshift_agent::clock::wall;
 use midshift_core::site::{Site, grid};
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
@@ -19,6 +18,7 @@ use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_proto::task::v1::{
     CancelTasksRequest, SubmitTaskRequest, SubmitTasksRequest, submit_task_result::Outcome,
 };
+use midshift_server::storage::Database;
 use std::path::{Path, PathBuf};
 use tokio::task::JoinSet;
 use tokio::time::Instant;

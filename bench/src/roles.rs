@@ -6,7 +6,7 @@ use crate::questions::answer_questions;
 use crate::session_baseline::Seen;
 use anyhow::Context;
 use midshift::robots::{IdentityFlags, SimRun, StopFlags};
-use midshift::serve::Serve;
+use midshift_server::serve::Serve;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -99,7 +99,7 @@ pub struct ChildArgs {
 
 /// Plays a role until stdin ends. On stdout: the address, then one number for each line of stdin that names a counter.
 pub fn play(args: ChildArgs) -> anyhow::Result<()> {
-    midshift::logs::start(midshift::logs::Format::Text, "error");
+    midshift_process::logs::start(midshift_process::logs::Format::Text, "error");
     if let Some(core) = args.core {
         take_core(core)?;
     }
@@ -117,9 +117,9 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
         Role::Serve { data, site, listen, store, ota_keys } => {
             let listen = listen.unwrap_or(address);
             answer_questions(listen, stop.clone(), metric)?;
-            let database = midshift::storage::Database { store };
+            let database = midshift_server::storage::Database { store };
             let serve = Serve { site, database, ..insecure_server(data, listen, ota_keys, 1) };
-            midshift::serve::run(serve, stop, &|_| ()).await
+            midshift_server::serve::run(serve, stop, &|_| ()).await
         }
         Role::Unary { answer } => {
             answer_questions(address, stop.clone(), |_| 0)?;
@@ -193,7 +193,7 @@ fn take_core(number: usize) -> anyhow::Result<()> {
 
 /// Sum of the lines of a counter in this process' metrics.
 fn metric(name: &str) -> u64 {
-    let text = midshift::recorder::handle().map(|m| m.render()).unwrap_or_default();
+    let text = midshift_process::recorder::handle().map(|m| m.render()).unwrap_or_default();
     let lines = text.lines().filter(|l| l.starts_with(name));
     lines.filter_map(|l| l.rsplit(' ').next()?.parse::<f64>().ok()).sum::<f64>() as u64
 }

@@ -8,10 +8,10 @@
 
 use super::old_site::{ENTRIES_KEPT, OldSite, commit, spec, submitted};
 use anyhow::Context;
-use midshift::clock::clock;
-use midshift::storage::{Database, Storage};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Index, Item, RowChange, Table, Write as Change, Writer};
+use midshift_process::clock::clock;
+use midshift_server::storage::{Database, Storage};
 use sqlx::postgres::PgConnectOptions;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{AssertSqlSafe, ConnectOptions, Connection, PgConnection, SqliteConnection};

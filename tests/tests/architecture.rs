@@ -41,10 +41,10 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/stop/src/line.rs", "one task a robot's line: it must outlive the handler that opened it"),
     ("services/stop/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/stop/src/threads.rs", "files of the stop service are read and written beside the threads that answer"),
-    ("services/midshift/src/dev/scenario.rs", "the binary makes releases for a story"),
-    ("services/midshift/src/dev/scenario/watch.rs", "the binary looks at robots while a story is played"),
-    ("services/midshift/src/backup/files.rs", "files are copied and read beside the runtime's threads"),
-    ("services/midshift/src/stop_follower.rs", "files of the stop service are read beside the runtime's threads"),
+    ("dev/src/scenario.rs", "the binary makes releases for a story"),
+    ("dev/src/scenario/watch.rs", "the binary looks at robots while a story is played"),
+    ("services/backup/src/files.rs", "files are copied and read beside the runtime's threads"),
+    ("services/server/src/stop_follower.rs", "files of the stop service are read beside the runtime's threads"),
     (
         "services/midshift/src/enrol_simulated.rs",
         "the binary enrols many machines side by side and renews what they got",
@@ -56,7 +56,7 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/store/src/sqlite/frames.rs", "the one writer of a file and its checkpoints"),
     ("services/store/src/postgres/mod.rs", "the one writer of a process, and what hears of the others"),
     ("services/store/src/postgres/frames.rs", "the one writer of a process"),
-    ("services/midshift/src/dev/run.rs", "the binary wires the parts"),
+    ("dev/src/run.rs", "the binary wires the parts"),
     ("services/midshift/src/commands/interrupts.rs", "the binary listens for Ctrl-C"),
 ];
 
@@ -72,7 +72,7 @@ const SYNCED_BY_HAND: &[(&str, &str)] = &[
     ("robot_agent/src/sets/slots.rs", "a slot stands for a partition, which has no other beside it"),
     ("robot_sim/src/body/files.rs", "a simulated body notes where it stands at each turn of its way"),
     ("services/identity/src/revocation_list.rs", "a line at a time"),
-    ("services/midshift/src/backup/place.rs", "a name that may not stay is taken back"),
+    ("services/backup/src/place.rs", "a name that may not stay is taken back"),
     ("services/ota/src/content.rs", "an upload comes a piece at a time"),
     ("services/ota/src/folder.rs", "a number is written where it lies, under the lock on its file"),
     ("services/ota/src/fixture.rs", "a test puts a file aside and back"),
@@ -93,6 +93,15 @@ const NAMES_KEPT: &[(&str, &str)] = &[
 ];
 
 const LINES_MAX: usize = 600;
+
+/// Folders of what runs on servers, at people's and on robots: not tests, benchmarks and xtask.
+const ROOMS: [&str; 11] =
+    ["cli", "core", "dev", "durable", "latch", "os", "ota_bundles", "proto", "robot_agent", "robot_sim", "services"];
+
+/// Sources of these rooms that are compiled into programs, and tests that stand among them.
+fn of_rooms(rooms: &[&str]) -> impl Iterator<Item = String> {
+    rooms.iter().flat_map(|room| files(room, "rs")).filter(|path| path.contains("/src/"))
+}
 
 /// Files that are still longer, below a folder, with how many of them there are. It only shrinks.
 const KNOWN_LONG: &[(&str, usize)] = &[("core/", 1), ("proto/", 2), ("tests/", 3)];
@@ -227,14 +236,13 @@ fn the_table_itself_lets_nothing_up_and_no_service_into_another() {
     let rules = allowed(&read("ARCHITECTURE.md"));
     assert_eq!(rules["core"], Some(BTreeSet::new()), "core imports none of ours");
     let services = ["task", "fleet", "telemetry", "ota", "stop", "identity"];
-    for (name, rule) in
-        rules.iter().filter(|(name, _)| !["midshift", "bench", "tests", "xtask"].contains(&name.as_str()))
-    {
+    let above = ["server", "dev", "midshift", "bench", "tests", "xtask"];
+    for (name, rule) in rules.iter().filter(|(name, _)| !above.contains(&name.as_str())) {
         let rule = rule.as_ref().unwrap_or_else(|| panic!("{name} may import everything"));
-        for service in services {
-            assert!(!rule.contains(service), "{name} may import the service {service}");
+        for service in services.iter().filter(|_| name != "backup") {
+            assert!(!rule.contains(*service), "{name} may import the service {service}");
         }
-        for above in ["midshift", "bench", "tests", "xtask"] {
+        for above in above {
             assert!(!rule.contains(above), "{name} may import {above}");
         }
     }
@@ -273,8 +281,11 @@ fn only_the_store_and_the_agent_know_sql_and_core_knows_no_runtime_and_no_wire()
         }
         let programs = [
             "midshift",
+            "midshift-backup",
             "midshift-cli",
+            "midshift-dev",
             "midshift-process",
+            "midshift-server",
             "midshift-stop",
             "midshift-bench",
             "midshift-tests",
@@ -377,9 +388,8 @@ fn code(text: &str) -> String {
 #[test]
 fn tasks_are_spawned_where_a_service_runs_and_nowhere_else() {
     let spawns = ["tokio::spawn(", "task::spawn(", "spawn_blocking(", "spawn_local(", "thread::spawn(", "JoinSet"];
-    let of_services = files("services", "rs").into_iter().chain(files("cli", "rs"));
-    let of_services = of_services.filter(|p| p.contains("/src/") && !p.ends_with("/tests.rs"));
-    for path in of_services {
+    let is_test = |path: &String| path.ends_with("/tests.rs") || path.contains("/tests/");
+    for path in of_rooms(&["cli", "dev", "services"]).filter(|path| !is_test(path)) {
         let text = code(&read(&path));
         let found = spawns.iter().find(|s| text.contains(*s));
         let may = path.ends_with("/src/lib.rs") || SPAWNS.iter().any(|(known, _)| *known == path);
@@ -416,18 +426,8 @@ fn files_are_made_durable_by_one_crate() {
         let text = code(&read(path));
         words.iter().find(|word| text.contains(**word)).copied()
     };
-    let rooms = [
-        "cli/src",
-        "core/src",
-        "proto/src",
-        "services",
-        "robot_agent/src",
-        "robot_sim/src",
-        "ota_bundles/src",
-        "latch/src",
-    ];
-    let all = rooms.into_iter().flat_map(|room| files(room, "rs"));
-    for path in all.filter(|path| path.contains("src/") && !path.contains("/tests")) {
+    let rooms = ROOMS.into_iter().filter(|room| *room != "durable").collect::<Vec<_>>();
+    for path in of_rooms(&rooms).filter(|path| !path.contains("/tests")) {
         let found = by_hand(&path);
         let may = SYNCED_BY_HAND.iter().any(|(known, _)| *known == path);
         assert!(found.is_none() || may, "{path} has {found:?}: use `durable`, or say in this test why not");
@@ -439,18 +439,12 @@ fn files_are_made_durable_by_one_crate() {
 
 #[test]
 fn there_is_no_unbounded_queue() {
-    for room in ["cli/src", "core/src", "os/src", "proto/src", "services", "robot_agent/src", "robot_sim/src"] {
-        for path in files(room, "rs").into_iter().filter(|p| p.contains("src/")) {
-            let text = code(&read(&path));
-            for word in [
-                "unbounded_channel",
-                "UnboundedSender",
-                "UnboundedReceiver",
-                "mpsc::unbounded",
-                "std::sync::mpsc::channel",
-            ] {
-                assert!(!text.contains(word), "{path} has {word}");
-            }
+    let words =
+        ["unbounded_channel", "UnboundedSender", "UnboundedReceiver", "mpsc::unbounded", "std::sync::mpsc::channel"];
+    for path in of_rooms(&ROOMS) {
+        let text = code(&read(&path));
+        for word in words {
+            assert!(!text.contains(word), "{path} has {word}");
         }
     }
 }
@@ -459,12 +453,9 @@ fn there_is_no_unbounded_queue() {
 fn wall_and_monotonic_clocks_are_read_by_the_binaries_alone() {
     // The launcher is a program of its own, kept beside the switch record that it reads. Others have the clock of `os`.
     let binaries = ["services/midshift/", "robot_agent/src/bin/", "robot_agent/src/launcher/mod.rs"];
-    for room in ["cli/src", "services", "robot_agent/src", "robot_sim/src"] {
-        for path in
-            files(room, "rs").into_iter().filter(|p| p.contains("src/") && !binaries.iter().any(|b| p.starts_with(b)))
-        {
-            assert!(!code(&read(&path)).contains("SystemTime::now"), "{path} reads the wall clock");
-        }
+    let rooms = ROOMS.into_iter().filter(|room| *room != "os").collect::<Vec<_>>();
+    for path in of_rooms(&rooms).filter(|path| !binaries.iter().any(|binary| path.starts_with(binary))) {
+        assert!(!code(&read(&path)).contains("SystemTime::now"), "{path} reads the wall clock");
     }
 }
 

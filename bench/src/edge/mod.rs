@@ -12,7 +12,7 @@ use crate::outcome::{Told, unless_stopped};
 use anyhow::{Context, ensure};
 use hostile::{ANSWERED, REFUSED, THERE, TURNED_AWAY};
 use load::Load;
-use midshift::door;
+use midshift_process::door;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;

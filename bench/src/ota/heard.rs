@@ -166,7 +166,7 @@ pub async fn told_ms(channel: Channel, robot_id: &str, code: u32, from_ms: i64) 
 /// Every STATUS sample of a robot in the record of a server that has ended, by number.
 async fn record(data: &Path, robot_id: &str) -> anyhow::Result<BTreeMap<u64, Kept>> {
     let site = text::parse(DEMO)?.site_id().clone();
-    let frames = SqliteFrames::open(data, site, midshift::clock::clock(1000), FRAME_BYTES_DEFAULT).await?;
+    let frames = SqliteFrames::open(data, site, midshift_process::clock::clock(1000), FRAME_BYTES_DEFAULT).await?;
     let (mut kept, mut position) = (BTreeMap::new(), 0);
     loop {
         let read = frames.read(position, READ_BYTES).await?;

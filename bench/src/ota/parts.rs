@@ -7,7 +7,6 @@ use crate::questions::answer_questions;
 use crate::robot;
 use anyhow::Context;
 use midshift::robots::{AgentRun, Config, IdentityFlags, StopFlags};
-use midshift::serve::{Serve, Software};
 use midshift_agent::bulk::Bulk;
 use midshift_agent::dial::TcpDial;
 use midshift_agent::sets::Wanted;
@@ -17,6 +16,7 @@ use midshift_agent::update::remote::GrpcRemote;
 use midshift_agent::update::{Done, Failure, Job};
 use midshift_core::robot::Lane;
 use midshift_core::time::Clock;
+use midshift_server::serve::{Serve, Software};
 use midshift_sim::faults::Injected;
 use midshift_sim::handle::SimHandle;
 use std::net::SocketAddr;
@@ -155,7 +155,7 @@ pub fn insecure_server(data: PathBuf, listen: SocketAddr, ota_keys: Option<PathB
         roles: Vec::new(),
         drain_seconds: None,
         no_software: false,
-        stop_listen: SocketAddr::from(([127, 0, 0, 1], midshift::stop::PORT)),
+        stop_listen: SocketAddr::from(([127, 0, 0, 1], midshift_core::stop::PORT)),
         init_stop: false,
         no_stop: true,
         log: Default::default(),
@@ -182,7 +182,7 @@ async fn serve(data: PathBuf, keys: PathBuf, listen: SocketAddr, stop: Cancellat
     let listen = free.local_addr()?;
     drop(free);
     answer_questions(listen, stop.clone(), |_| 0)?;
-    midshift::serve::run(insecure_server(data, listen, Some(keys), 64), stop, &|_| ()).await
+    midshift_server::serve::run(insecure_server(data, listen, Some(keys), 64), stop, &|_| ()).await
 }
 
 async fn agent(

@@ -29,7 +29,7 @@ pub struct SwarmArgs {
 /// Runs all of them until `stop`: nothing goes wrong by itself, and no battery empties.
 pub async fn run(args: SwarmArgs, stop: CancellationToken) -> anyhow::Result<()> {
     let site = midshift_cli::site_file::load(Some(&args.site), None, None)?.site;
-    let clock: Arc<dyn Clock> = midshift::clock::clock(1000);
+    let clock: Arc<dyn Clock> = midshift_process::clock::clock(1000);
     let config = FleetConfig { faults: FaultRates::none(), drains: false, ..FleetConfig::new(site, args.robots, SEED) };
     let hall = Arc::new(Fleet::open(&config, &clock.now())?);
     let uri = midshift_cli::endpoint::uri(&args.server);

@@ -61,7 +61,7 @@ pub struct Site {
 impl Site {
     /// With so many robots; its keys are below `room`.
     pub async fn with(robots: usize, room: &Path) -> anyhow::Result<Self> {
-        let clock: Arc<dyn Clock> = midshift::clock::clock(1000);
+        let clock: Arc<dyn Clock> = midshift_process::clock::clock(1000);
         let store = MemoryStore::new(SiteId::parse(SITE)?, StoreId::fresh(), clock.clone());
         let (duty, names) = (Duty::Authority, Vec::new());
         let folder = room.join("identity");
@@ -78,7 +78,7 @@ impl Site {
     }
     /// Writes down who is known for a stop service with this data folder.
     pub fn admit(&self, data: &Path) -> anyhow::Result<()> {
-        let folder = data.join(midshift::stop::FOLDER);
+        let folder = data.join(midshift_core::stop::FOLDER);
         // A folder that others may look into is refused.
         DirBuilder::new().recursive(true).mode(0o700).create(&folder)?;
         announce_first_start(&folder)?;

@@ -22,5 +22,7 @@ pub use scope::Scope;
 
 /// The folder of the stop service's files, below the data folder of its server.
 pub const FOLDER: &str = "stop";
+/// The file in that folder with what a stop service writes that `serve` started.
+pub const LOG: &str = "log";
 /// Port of the stop service, beside the 7420 of the business.
 pub const PORT: u16 = 7421;

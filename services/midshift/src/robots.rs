@@ -1,7 +1,5 @@
 //! Robots in processes of their own: one agent with a simulated body that survives its process, or a swarm against a server elsewhere.
 
-use crate::clock;
-use crate::door;
 use crate::enrol_simulated::{Machines, Replace, Replaced};
 use crate::software::{self, Behaving};
 use anyhow::{Context, bail};
@@ -12,6 +10,8 @@ use midshift_cli::site_file;
 use midshift_core::Boxed;
 use midshift_core::ids::{RobotId, WaypointId};
 use midshift_core::time::Clock;
+use midshift_process::clock;
+use midshift_process::door;
 use midshift_sim::body::{BodyConfig, SimBody};
 use midshift_sim::faults::FaultRates;
 use midshift_sim::fleet::{Fleet, FleetConfig, Persistence};

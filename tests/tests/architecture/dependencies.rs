@@ -130,3 +130,19 @@ fn the_roots_of_the_public_web_are_the_stand_in_and_nothing_else() {
         assert!(!read("Cargo.lock").contains(&format!("name = \"{other}\"")), "{other} brings roots of the public web");
     }
 }
+
+#[test]
+fn no_package_of_a_program_has_a_profile_of_its_own() {
+    // Cargo passes `strip = "debuginfo"` instead of the profile's to a package that an override names.
+    let workspace: toml::Table = read("Cargo.toml").parse().expect("a manifest");
+    let overrides = workspace["profile"]["release"]["package"].as_table().expect("overrides");
+    let has_program = |(folder, manifest): &(String, toml::Table)| {
+        manifest.contains_key("bin")
+            || [root().join(folder).join("src/main.rs"), root().join(folder).join("src/bin")].iter().any(|p| p.exists())
+    };
+    let programs: Vec<String> = members().iter().filter(|m| has_program(m)).map(|(_, m)| package(m)).collect();
+    assert!(["midshift", "midshift-stop", "midshift-agent"].iter().all(|p| programs.iter().any(|found| found == p)));
+    assert!(overrides.keys().any(|name| name.starts_with("midshift-")), "the question can be answered with yes");
+    let stripped_less: Vec<_> = programs.iter().filter(|name| overrides.contains_key(*name)).collect();
+    assert!(stripped_less.is_empty(), "its symbols would stay in the program: {stripped_less:?}");
+}

@@ -1,6 +1,6 @@
 //! What programs log: ids and codes, never where something is or what somebody has written.
 
-use crate::{code, files, read};
+use crate::{ROOMS, code, of_rooms, read};
 use std::collections::BTreeSet;
 
 /// Names of fields of the log that would be where something is, or what somebody has written.
@@ -66,19 +66,15 @@ const LOGGED: &[(&str, &str, &str)] = &[
     ("robot_sim/src/swarm.rs", "why", "what the operating system said of a program"),
     ("services/fleet/src/reconcile.rs", "text", "the key of a row, and what could not be read of it"),
     ("services/fleet/src/standby.rs", "text", "the key of a row, and what could not be read of it"),
-    ("services/midshift/src/dev/mod.rs", "warning", "what the lint says of the site's own file"),
+    ("dev/src/lib.rs", "warning", "what the lint says of the site's own file"),
     ("services/midshift/src/robots.rs", "deed", "a word and an id"),
-    ("services/midshift/src/serve.rs", "warning", "what the lint says of the site's own file"),
+    ("services/server/src/serve.rs", "warning", "what the lint says of the site's own file"),
     ("services/ota/src/repository.rs", "why", "one of a closed list of words"),
     ("services/ota/src/repository.rs", "advice", "a sentence of this program"),
     ("services/ota/src/repository/documents.rs", "problem", "what is wrong with a signed file"),
     ("services/ota/src/rollouts/reconcile.rs", "text", "the key of a row, and what could not be read of it"),
     ("services/ota/src/rollouts/standby.rs", "text", "the key of a row, and what could not be read of it"),
-    (
-        "services/midshift/src/stop/started.rs",
-        "why",
-        "a sentence of this program, or what the system said of a process",
-    ),
+    ("services/server/src/stop/started.rs", "why", "a sentence of this program, or what the system said of a process"),
     ("services/stop/src/changes.rs", "level", "one of four words"),
     ("services/stop/src/opening.rs", "why", "a sentence of this program"),
     ("services/telemetry/src/link.rs", "why", "which field breaks which rule, in the words of the decoder"),
@@ -161,26 +157,15 @@ fn tells(call: &str) -> Vec<String> {
 #[test]
 fn logs_carry_ids_and_codes_and_never_where_something_is_or_what_somebody_wrote() {
     let (mut calls, mut used) = (0, BTreeSet::new());
-    for room in [
-        "cli/src",
-        "core/src",
-        "proto/src",
-        "services",
-        "robot_agent/src",
-        "robot_sim/src",
-        "latch/src",
-        "ota_bundles/src",
-    ] {
-        for path in files(room, "rs").into_iter().filter(|p| p.contains("src/")) {
-            for call in logged(&code(&read(&path))) {
-                calls += 1;
-                for name in tells(&call) {
-                    let known = LOGGED.iter().find(|(file, field, _)| *file == path && *field == name);
-                    let known = known.unwrap_or_else(|| {
-                        panic!("{path} logs {name}: log its id or code, or say in this test why it is neither: {call}")
-                    });
-                    used.insert((known.0, known.1));
-                }
+    for path in of_rooms(&ROOMS) {
+        for call in logged(&code(&read(&path))) {
+            calls += 1;
+            for name in tells(&call) {
+                let known = LOGGED.iter().find(|(file, field, _)| *file == path && *field == name);
+                let known = known.unwrap_or_else(|| {
+                    panic!("{path} logs {name}: log its id or code, or say in this test why it is neither: {call}")
+                });
+                used.insert((known.0, known.1));
             }
         }
     }

@@ -106,7 +106,7 @@ fn task_name(nth: usize) -> String {
 impl Arena {
     /// Starts the server and its honest robots, and waits until they have done something.
     pub async fn open(seed: u64) -> anyhow::Result<Self> {
-        let (dir, site, clock) = (folder()?, Arc::new(text::parse(DEMO)?), midshift::clock::clock(1000));
+        let (dir, site, clock) = (folder()?, Arc::new(text::parse(DEMO)?), midshift_process::clock::clock(1000));
         let server = Server::start(dir.path()).await?;
         let of_hall = FleetConfig {
             faults: FaultRates::none(),

@@ -87,7 +87,7 @@ async fn after_a_cut_of_twenty_seconds_every_event_is_there_in_order_and_once() 
     })
     .await?;
     let before = newest(&events(&mut telemetry.clone()).await?);
-    let clock = midshift::clock::clock(1000);
+    let clock = midshift_process::clock::clock(1000);
     proxy.sever();
     let from_ms = clock.now().wall.0;
     until("the server to miss all five at once", Duration::from_secs(15), || {

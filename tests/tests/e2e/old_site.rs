@@ -6,20 +6,17 @@
 use crate::harness::{channel, free_port, tasks, until};
 use crate::room::LIMIT;
 use anyhow::{Context, ensure};
-use midshift::backup::{Access, Places, back_up, restore, verify};
-use midshift::clock::{at, clock};
-use midshift::dev::task_summary;
-use midshift::dev::throwaway::Throwaway;
-use midshift::door;
-use midshift::planning::Planning;
-use midshift::server::{Components, Naive, Server};
-use midshift::storage::{Database, Storage};
 use midshift_agent::clock::wall;
+use midshift_backup::{Access, Places, back_up, restore, verify};
 use midshift_cli::roles::Roles;
 use midshift_core::rows::Table;
 use midshift_core::site::{CORRIDOR, Site, text};
 use midshift_core::task::TaskState;
 use midshift_core::time::{Clock, Utc};
+use midshift_dev::task_summary;
+use midshift_dev::throwaway::Throwaway;
+use midshift_process::clock::{at, clock};
+use midshift_process::door;
 use midshift_proto::fleet::v1::ExplainTaskRequest;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::task::v1::watch_tasks_response::Item;
@@ -27,6 +24,9 @@ use midshift_proto::task::v1::{
     FlatTask, GetTaskRequest, ListTasksRequest, SubmitTaskRequest, TaskFilter, WatchTasksRequest,
     submit_task_request::Body,
 };
+use midshift_server::planning::Planning;
+use midshift_server::storage::{Database, Storage};
+use midshift_server::{Components, Naive, Server};
 use midshift_store::{Query, load};
 use midshift_tests::counted::Counted;
 use midshift_tests::old_site::{DAY_MS, OldSite, task_id};

@@ -58,7 +58,7 @@ impl Room {
         let server = Server::start_on(dir.path(), site).await?;
         let world = WorldConfig { auto_stock: true, ..WorldConfig::default() };
         let world = World::new(world, &text::parse(CORRIDOR)?).shared();
-        Ok(Self { server, clock: midshift::clock::clock(1000), world, dir })
+        Ok(Self { server, clock: midshift_process::clock::clock(1000), world, dir })
     }
 
     /// A robot whose body stands at `start` and whose agent dials `address`.

@@ -105,7 +105,7 @@ async fn a_robot_that_nobody_hears_for_twenty_seconds_works_on_and_one_among_peo
     })
     .await?;
 
-    let clock = midshift::clock::clock(1000);
+    let clock = midshift_process::clock::clock(1000);
     link.sever();
     line.sever();
     let from_ms = clock.now().wall.0;

@@ -14,5 +14,5 @@ pub fn nothing_stands_unexplained(counted: &Metrics, seen: &mut Observer) {
 
 /// What the server counted of itself until this moment.
 pub fn counted() -> Metrics {
-    Metrics(midshift::recorder::handle().map(|handle| handle.render()).unwrap_or_default())
+    Metrics(midshift_process::recorder::handle().map(|handle| handle.render()).unwrap_or_default())
 }

@@ -6,7 +6,6 @@ use crate::orders::Order;
 use crate::room::Naive;
 use crate::run::steer;
 use crate::software::GOOD;
-use midshift::server::Naive as Server;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_core::fleet::bugs::{Bugs as FleetBugs, SeededBug as Fleet};
 use midshift_core::rollout::bugs::{Bugs as RolloutBugs, SeededBug as Rollouts};
@@ -14,6 +13,7 @@ use midshift_core::rollout::rows::Phase;
 use midshift_core::update::UpdateState;
 use midshift_proto::ota::v1::RolloutSpec;
 use midshift_proto::ota::v1::rollout_wave::Size;
+use midshift_server::Naive as Server;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 fn rollouts(bug: Rollouts) -> Naive {

@@ -89,7 +89,7 @@ fn run(seed: u64, naive: Naive, habit: Option<Habit>) -> Outcome {
 impl Game {
     fn open(seed: u64, naive: Naive, habit: Option<Habit>) -> anyhow::Result<Self> {
         // Counters are counted from the first on.
-        midshift::recorder::handle();
+        midshift_process::recorder::handle();
         let mut rng = StdRng::seed_from_u64(seed);
         let (honest, many, tasks) = (rng.random_range(2..=4), rng.random_range(1..=2), rng.random_range(4..=8));
         let site = site()?;

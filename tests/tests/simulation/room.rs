@@ -13,7 +13,6 @@ use crate::observer::Shared;
 use crate::software::Software;
 use crate::stops::Stops;
 use crate::wall::ServerWall;
-use midshift::server::{Components, Server};
 use midshift_agent::body::Body;
 use midshift_agent::bugs::Bugs;
 use midshift_agent::memory::MemoryStore as RobotMemory;
@@ -25,6 +24,7 @@ use midshift_core::task::machine::Phase;
 use midshift_core::time::{SiteDuration, SiteTime};
 use midshift_edge::Incoming;
 use midshift_ota::rollouts::RolloutService;
+use midshift_server::{Components, Server};
 use midshift_sim::faults::{FaultRates, Injected};
 use midshift_sim::fleet::{Fleet, FleetConfig};
 use midshift_sim::launched::Launched;
@@ -57,7 +57,7 @@ pub struct Naive {
     /// Of every agent.
     pub agent: Bugs,
     /// Of the server.
-    pub server: midshift::server::Naive,
+    pub server: midshift_server::Naive,
 }
 
 /// What a room is opened with.
@@ -333,7 +333,7 @@ fn serve(
                     naive: naive.server,
                     stops: stops.clone(),
                     identity: None,
-                    port: midshift::door::alone("business"),
+                    port: midshift_process::door::alone("business"),
                     planning: tokio::runtime::Handle::current(),
                 };
                 // A service manager starts a server again that could not read its disk.

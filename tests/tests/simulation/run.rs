@@ -84,7 +84,7 @@ struct Shift {
 impl Shift {
     fn open(seed: u64, naive: Naive) -> anyhow::Result<Self> {
         // Counters are counted from the first on.
-        midshift::recorder::handle();
+        midshift_process::recorder::handle();
         let plan = Plan::draw(seed, &*site()?)?;
         let faults = FaultRates { jam_per_action: 0.0, silence_per_hour: 0.0, ..FaultRates::default() };
         let config = RoomConfig {
@@ -366,7 +366,7 @@ impl Shift {
 
 /// STATUS that the servers of this process took beside sessions, samples.
 fn replayed() -> u64 {
-    let metrics = midshift::recorder::handle().map(|handle| handle.render()).unwrap_or_default();
+    let metrics = midshift_process::recorder::handle().map(|handle| handle.render()).unwrap_or_default();
     let line = metrics.lines().find_map(|line| line.strip_prefix("midshift_telemetry_status_replayed_total "));
     line.and_then(|number| number.parse().ok()).unwrap_or(0)
 }

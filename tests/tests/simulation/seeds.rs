@@ -3,9 +3,9 @@
 use crate::room::Naive;
 use crate::run::Outcome;
 use crate::stderr::print_line;
-use midshift::server::Naive as Server;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_core::fleet::bugs::SeededBug as Fleet;
+use midshift_server::Naive as Server;
 use std::collections::BTreeMap;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};

@@ -118,7 +118,7 @@ pub struct Rows {
 
 impl Rows {
     async fn read(dir: &Path, site: SiteId) -> anyhow::Result<Self> {
-        let store = SqliteStore::open(dir, site, midshift::clock::clock(1000)).await?;
+        let store = SqliteStore::open(dir, site, midshift_process::clock::clock(1000)).await?;
         let snapshot = store.snapshot(&[Table::DesiredUpdate, Table::RolloutRobot]).await?;
         store.close().await;
         let of = |table: Table| snapshot.rows.iter().filter(move |row| row.key.table == table);

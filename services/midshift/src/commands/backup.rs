@@ -1,11 +1,11 @@
 //! `midshift backup` and `midshift restore`.
 
-use crate::backup::{self, Access, Identity, KEYS, Places, Settled, Summary};
-use crate::clock;
-use crate::storage::Database;
+use midshift_backup::{Access, Identity, KEYS, Places, Settled, Summary};
 use midshift_cli::client::Exit;
 use midshift_cli::out::{Format, Out, columns};
+use midshift_process::clock;
 use midshift_proto::convert::timestamp;
+use midshift_server::storage::Database;
 use std::path::{Path, PathBuf};
 
 /// What to copy.
@@ -55,10 +55,10 @@ pub struct Restore {
 /// Copies everything durable of a server, and prints a summary of the copy.
 pub async fn back_up(args: &Take, out: &Out) -> Result<(), Exit> {
     let from = Places { data: args.data.clone(), ota_keys: args.ota_keys.clone(), store: args.database.postgres()? };
-    let summary = backup::back_up(&from, &args.to, clock::clock(1000).now().wall).await?;
+    let summary = midshift_backup::back_up(&from, &args.to, clock::clock(1000).now().wall).await?;
     show(&summary, None, out)?;
     // The backup is whole, whether or not that can be said.
-    if let Err(error) = backup::told::leave_note(&from.data, &summary, &args.to) {
+    if let Err(error) = midshift_backup::told::leave_note(&from.data, &summary, &args.to) {
         out.inform(&format!("warning: the audit will have no row of this backup: {error:#}"));
     }
     out.next(&format!("midshift restore --verify --from {}", word(&args.to.to_string_lossy())));
@@ -71,12 +71,12 @@ pub async fn restore(args: &Restore, out: &Out) -> Result<(), Exit> {
         if args.database.store.is_some() {
             out.inform("--verify reads the backup only and asks no database");
         }
-        return show(&backup::verify(&args.from).await?, None, out);
+        return show(&midshift_backup::verify(&args.from).await?, None, out);
     };
     let to = Places { data, ota_keys: args.ota_keys.clone(), store: args.database.postgres()? };
     let access = Access { revocations: args.revocations.clone(), identity: args.identity };
-    let (summary, settled) = backup::restore(&args.from, &to, &access, clock::clock(1000).now().wall).await?;
-    if let Err(error) = backup::told::leave_restored(&to.data, &args.from, &access, &settled) {
+    let (summary, settled) = midshift_backup::restore(&args.from, &to, &access, clock::clock(1000).now().wall).await?;
+    if let Err(error) = midshift_backup::told::leave_restored(&to.data, &args.from, &access, &settled) {
         out.inform(&format!("warning: the audit will have no row of this restore: {error:#}"));
     }
     show(&summary, Some(&settled), out)?;

@@ -4,8 +4,6 @@
 //! So whoever reaches the store may ask, nobody else, and the audit has it. A database is older than the site's authority, so it has one of its own,
 //! whose key signs twice and is thrown away.
 
-use crate::clock;
-use crate::storage::Database;
 use anyhow::Context;
 use clap::Subcommand;
 use midshift_cli::client::Exit;
@@ -14,6 +12,8 @@ use midshift_cli::site_file;
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_identity::{Duty, IdentityService, PUBLIC_FILE, Parts};
+use midshift_process::clock;
+use midshift_server::storage::Database;
 use rcgen::{
     BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
 };

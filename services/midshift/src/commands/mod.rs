@@ -6,12 +6,8 @@ mod interrupts;
 mod sim;
 mod stop;
 
-use crate::components::Naive;
-use crate::dev::Dev;
+use crate::robots;
 use crate::robots::AgentRun;
-use crate::serve::Serve;
-use crate::storage::Database;
-use crate::{dev, logs, robots, serve};
 use clap::{Parser, Subcommand};
 use interrupts::interrupts;
 use midshift_agent::core::ExitReason;
@@ -19,6 +15,12 @@ use midshift_agent::launcher::{self, ENVIRONMENT, SWITCHED};
 use midshift_agent::{environment, launcher_heartbeat};
 use midshift_cli::client::Exit;
 use midshift_cli::out::{Format, Out, Output};
+use midshift_dev::Dev;
+use midshift_process::logs;
+use midshift_server::Naive;
+use midshift_server::serve;
+use midshift_server::serve::Serve;
+use midshift_server::storage::Database;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
@@ -123,7 +125,7 @@ pub fn main() -> ExitCode {
     {
         // The same process: whoever has started it goes on with its id, its input and its signals.
         let log = args.log.argument().into_iter();
-        let error = crate::stop::replace_this(&log.chain(arguments.iter().cloned()).collect::<Vec<_>>());
+        let error = midshift_server::stop::replace_this(&log.chain(arguments.iter().cloned()).collect::<Vec<_>>());
         return Exit::from(error).report(&Out::for_output(args.output));
     }
     let serves = matches!(&args.command, Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run { .. }));
@@ -173,33 +175,15 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
 
 async fn develop(args: Dev, out: &Out) -> Result<(), Exit> {
     let bounded = args.run_for.is_some() || args.scenario.is_some();
-    let report = dev::run(args, interrupts(), &|text| out.inform(text)).await?;
-    let objections = report.objections();
-    if bounded {
-        out.inform(&format!(
-            "{:.0} s of site time in {:.0} s: {} submitted, {} succeeded, {} failed, {} canceled, {} expired, {} to operator, {} open; \
-             {:.0} tasks/h, completion p50 {:.0} s p95 {:.0} s, empty {:.0} %, {} exclusion violations (collisions: {})",
-            report.site_s,
-            report.wall_s,
-            report.submitted,
-            report.succeeded,
-            report.failed,
-            report.canceled,
-            report.expired,
-            report.to_operator,
-            report.open,
-            report.tasks_per_site_hour,
-            report.completion_s.p50,
-            report.completion_s.p95,
-            report.empty_run_rate * 100.0,
-            report.exclusion_violations,
-            report.collisions
-        ));
+    let report = midshift_dev::run(args, interrupts(), &|text| out.inform(text)).await?;
+    if !bounded {
+        return Ok(());
     }
-    if bounded && !objections.is_empty() {
-        return Err(anyhow::anyhow!("the run is not good: {}", objections.join("; ")).into());
+    out.inform(&report.summary());
+    match report.objections() {
+        objections if objections.is_empty() => Ok(()),
+        objections => Err(anyhow::anyhow!("the run is not good: {}", objections.join("; ")).into()),
     }
-    Ok(())
 }
 
 async fn migrate(data: &std::path::Path, database: &Database, out: &Out) -> Result<(), Exit> {

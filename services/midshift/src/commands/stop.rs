@@ -1,11 +1,11 @@
 //! `midshift stop …`: asks the stop service that runs, checks its files, or becomes one.
 
-use crate::stop::FOLDER;
 use clap::{Args, Subcommand};
 use midshift_cli::Command;
 use midshift_cli::client::Exit;
 use midshift_cli::out::{Format, Out};
 use midshift_cli::stop::{self, Engage, Request};
+use midshift_core::stop::FOLDER;
 use std::path::{Path, PathBuf};
 
 /// Stops robots, at once and without asking back: an operational stop request; not a safety function, no performance level; the independent emergency stop is the robot

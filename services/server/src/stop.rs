@@ -10,13 +10,12 @@ mod program;
 mod started;
 
 pub use first_start::{Occasion, announce};
-pub use midshift_core::stop::{FOLDER, PORT};
 pub use program::{check_program, replace_this};
-pub use started::{LOG, Started};
+pub use started::Started;
 
-use crate::{door, recorder};
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
+use midshift_process::{door, recorder};
 use midshift_stop::{Parts, StopService, port};
 use std::net::SocketAddr;
 use std::path::PathBuf;

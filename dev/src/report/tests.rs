@@ -1,13 +1,13 @@
 //! What a run must have come to: rows in a real store, bodies of a real hall that stood still.
 
 use super::{Inputs, Kind, Report};
-use crate::clock;
-use crate::dev::task_summary::read_once;
+use crate::task_summary::read_once;
 use midshift_core::ids::TaskId;
 use midshift_core::rows::{Item, Writer};
 use midshift_core::site::{DEMO, text};
 use midshift_core::task::forms::Transport;
 use midshift_core::task::{Phase, TaskIntake, TaskState};
+use midshift_process::clock;
 use midshift_sim::fleet::{Fleet, FleetConfig, FleetReport};
 use midshift_store::{MemoryStore, Store, StoreId};
 use std::sync::Arc;

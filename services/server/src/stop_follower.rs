@@ -338,7 +338,7 @@ mod tests {
 
     #[tokio::test]
     async fn one_that_was_revoked_is_on_the_roster_no_more_until_it_is_enrolled_again() -> anyhow::Result<()> {
-        let store = MemoryStore::new(SiteId::parse("demo")?, StoreId::fresh(), crate::clock::clock(1000));
+        let store = MemoryStore::new(SiteId::parse("demo")?, StoreId::fresh(), midshift_process::clock::clock(1000));
         let robot_id = RobotId::parse("r1")?;
         let mut robot = RobotIdentity::new(robot_id.clone());
         let gone = async |robot: &RobotIdentity, expect: Expect, ms: i64| {
@@ -361,7 +361,8 @@ mod tests {
 
     #[tokio::test]
     async fn one_that_was_revoked_is_listed_by_whoever_begins_anew_until_it_stands_by_itself() -> anyhow::Result<()> {
-        let store = Arc::new(MemoryStore::new(SiteId::parse("demo")?, StoreId::fresh(), crate::clock::clock(1000)));
+        let store =
+            Arc::new(MemoryStore::new(SiteId::parse("demo")?, StoreId::fresh(), midshift_process::clock::clock(1000)));
         let mut robot = RobotIdentity::new(RobotId::parse("r1")?);
         robot.revoke("anna", Utc(1_000_000));
         let mut revoked = Item::new(Writer::Identity, "anna");
@@ -373,7 +374,7 @@ mod tests {
         assert!(store.commit(vec![revoked, attached]).await.iter().all(Result::is_ok));
         let folder = tempfile::tempdir()?;
         for (ms, is_listed) in [(1_001_000, true), (1_020_000, true), (1_100_000, false)] {
-            let clock = crate::clock::at(Utc(ms), 1000);
+            let clock = midshift_process::clock::at(Utc(ms), 1000);
             let mut follower = StopFollower::new(folder.path().to_owned(), store.clone(), None, clock);
             follower.look_who_is_gone().await?;
             follower.look_who_attached().await?;
@@ -392,7 +393,8 @@ mod tests {
 
     #[tokio::test]
     async fn a_copy_of_a_newer_version_is_left_as_it_is_and_stops_the_copying_of_no_other() -> anyhow::Result<()> {
-        let store = Arc::new(MemoryStore::new(SiteId::parse("demo")?, StoreId::fresh(), crate::clock::clock(1000)));
+        let store =
+            Arc::new(MemoryStore::new(SiteId::parse("demo")?, StoreId::fresh(), midshift_process::clock::clock(1000)));
         let record = StopRecord { stop: stop("S1")?, reset: None };
         let body = record.body().replace("\"halt\"", "\"hover\"");
         let write = Write::Put { index: record.index(), body: body.as_str().into() };
@@ -403,7 +405,8 @@ mod tests {
         latch.engage(stop("S1")?);
         latch.engage(stop("S2")?);
         let folder = tempfile::tempdir()?;
-        let mut follower = StopFollower::new(folder.path().to_owned(), store.clone(), None, crate::clock::clock(1000));
+        let mut follower =
+            StopFollower::new(folder.path().to_owned(), store.clone(), None, midshift_process::clock::clock(1000));
         follower.copy(1, &latch).await?;
         let rows = store.snapshot(&[Table::StopRecord]).await?.rows;
         let kept: Vec<_> = rows.iter().filter(|row| &*row.key.id == "S1").map(|row| &*row.body).collect();

@@ -85,13 +85,13 @@ async fn read_history(store: &dyn Store) -> anyhow::Result<(Option<String>, bool
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clock;
     use midshift_core::ids::{RobotId, SiteId, StopId};
     use midshift_core::robot::StopLevel;
     use midshift_core::rows::{Item, Writer};
     use midshift_core::stop::record::StopRecord;
     use midshift_core::stop::{Scope, Stop};
     use midshift_core::time::Utc;
+    use midshift_process::clock;
     use midshift_stop::FIRST;
     use midshift_store::{MemoryStore, StoreId};
 

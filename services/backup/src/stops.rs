@@ -5,9 +5,9 @@
 
 use super::files::{blocking, copy, copy_if_there, entries};
 use super::part::{Making, Part, Places, Said};
-use crate::stop::{FOLDER, LOG};
 use anyhow::{Context, ensure};
 use async_trait::async_trait;
+use midshift_core::stop::{FOLDER, LOG};
 use midshift_identity::RevocationList;
 use midshift_stop::{Copied, FIRST, HOLDER};
 use std::fs;

@@ -1,10 +1,10 @@
 //! Old connections from the door to the robot: the port tells the service, the service tells the robot, and the robot's next session is a succession.
 
-use crate::door::{alone, serve};
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::time::Clock;
 use midshift_core::time::{LinkDuration, ScaledClock, Utc};
 use midshift_edge::{Age, Config};
+use midshift_process::door::{alone, serve};
 use midshift_proto::convert::stop::{FromStop, ToStop};
 use midshift_proto::link::v1::SessionRequest;
 use midshift_proto::link::v1::link_service_client::LinkServiceClient;

@@ -1,7 +1,7 @@
 //! What a run came to, counted from rows and from the bodies' own journals, never from what was planned.
 
-use crate::dev::scenario::Story;
-use crate::dev::task_summary::Tasks;
+use crate::scenario::Story;
+use crate::task_summary::Tasks;
 use midshift_core::ids::TaskId;
 use midshift_core::task::Phase;
 use midshift_core::time::Clock;
@@ -238,6 +238,29 @@ impl Report {
             story: i.story,
         }
     }
+    /// The run in one line.
+    pub fn summary(&self) -> String {
+        format!(
+            "{:.0} s of site time in {:.0} s: {} submitted, {} succeeded, {} failed, {} canceled, {} expired, {} to operator, {} open; \
+             {:.0} tasks/h, completion p50 {:.0} s p95 {:.0} s, empty {:.0} %, {} exclusion violations (collisions: {})",
+            self.site_s,
+            self.wall_s,
+            self.submitted,
+            self.succeeded,
+            self.failed,
+            self.canceled,
+            self.expired,
+            self.to_operator,
+            self.open,
+            self.tasks_per_site_hour,
+            self.completion_s.p50,
+            self.completion_s.p95,
+            self.empty_run_rate * 100.0,
+            self.exclusion_violations,
+            self.collisions
+        )
+    }
+
     /// Why the run cannot be called good; empty if it can.
     pub fn objections(&self) -> Vec<String> {
         let mut why = Vec::new();

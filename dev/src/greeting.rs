@@ -1,8 +1,8 @@
 //! What `dev` says first: what runs where, and what to try.
 
 use super::args::Dev;
-use crate::stop;
 use midshift_core::site::Site;
+use midshift_core::stop::PORT;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -15,7 +15,7 @@ pub fn greeting(args: &Dev, site: &Site, address: SocketAddr, stops: SocketAddr,
         .as_ref()
         .map_or("data in memory (--data DIR keeps it)".to_owned(), |d| format!("data in {}", d.display()));
     let server = if address.port() == 7420 { String::new() } else { format!(" --server {address}") };
-    let stop_server = if stops.port() == stop::PORT { String::new() } else { format!(" --stop-server {stops}") };
+    let stop_server = if stops.port() == PORT { String::new() } else { format!(" --stop-server {stops}") };
     let mut stations =
         site.stations().chain(site.of_kind(midshift_core::site::Kind::Junction)).map(|w| site.name_of(w).to_string());
     let (from, to) = if site.source() == midshift_core::site::Source::Authored && site.site_id().as_str() == "demo" {

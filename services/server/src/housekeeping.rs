@@ -7,7 +7,6 @@
 mod oldest;
 
 use crate::components::Components;
-use crate::recorder;
 use metrics_exporter_prometheus::PrometheusHandle;
 use midshift_cli::roles::Role;
 use midshift_core::fleet::rows::FleetMark;
@@ -17,6 +16,7 @@ use midshift_core::rollout::rows::OtaMark;
 use midshift_core::rows::{Log, Seq, Writer};
 use midshift_core::time::{Clock, Utc};
 use midshift_identity::audit::upkeep as audit;
+use midshift_process::recorder;
 use midshift_store::{Error, FrameLog, Retention as EntriesKept, Store};
 use midshift_task::TaskService;
 use midshift_telemetry::precision;

@@ -1,11 +1,12 @@
 //! The stop service of a `dev` run.
 
 use super::args::Dev;
-use crate::stop::{self, Beside};
-use crate::stop_follower;
 use anyhow::Context;
 use midshift_core::site::Site;
+use midshift_core::stop::{FOLDER, PORT};
 use midshift_core::time::Clock;
+use midshift_server::stop::{self, Beside};
+use midshift_server::stop_follower;
 use midshift_store::Store;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -31,14 +32,14 @@ impl Stops {
         (address, store): (SocketAddr, &dyn Store),
     ) -> anyhow::Result<Self> {
         let free = SocketAddr::new(address.ip(), 0);
-        let usual = if args.listen.port() == 0 { free } else { SocketAddr::new(address.ip(), stop::PORT) };
+        let usual = if args.listen.port() == 0 { free } else { SocketAddr::new(address.ip(), PORT) };
         let listener = std::net::TcpListener::bind(usual).or_else(|_| std::net::TcpListener::bind(free));
         let listener = listener.context("listening for stops")?;
         let (folder, temporary) = match &args.data {
-            Some(data) => (data.join(stop::FOLDER), None),
+            Some(data) => (data.join(FOLDER), None),
             None => {
                 let temporary = tempfile::tempdir().context("making a folder for stops")?;
-                (temporary.path().join(stop::FOLDER), Some(temporary))
+                (temporary.path().join(FOLDER), Some(temporary))
             }
         };
         stop::announce(&folder, store, stop::Occasion::Start).await?;

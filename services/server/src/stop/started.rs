@@ -4,17 +4,17 @@
 //! What it says goes to a file of its own: it must not depend on where the server's own words go.
 
 use super::program;
-use crate::clock;
 use anyhow::{Context, bail};
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_agent::tls::{self, Tls};
-use midshift_cli::stop_service::FOLDER;
 use midshift_core::limits;
 use midshift_core::maintenance::INCIDENT;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::rows::{Fact, Item, Log, Writer};
 use midshift_core::stop::hung::{Answer, Hung, Look, Verdict};
+use midshift_core::stop::{FOLDER, LOG};
 use midshift_core::time::{Clock, LinkTime};
+use midshift_process::clock;
 use midshift_stop::NotEnded;
 use midshift_stop::program::UP_WITHIN;
 use midshift_store::Store;
@@ -36,8 +36,6 @@ use tonic_health::pb::health_client::HealthClient;
 
 /// How often it is looked whether one that was started answers.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// In its folder: what a stop service says that `serve` has started.
-pub const LOG: &str = "log";
 /// One that has more than this begins anew, bytes.
 const LOG_BYTES_MAX: u64 = 4 * 1024 * 1024;
 /// One that hangs is found out when it has not answered for so long, time after time; one that is gone is found out at the next look.

@@ -1,7 +1,6 @@
 //! A backup is whole, says when it is not, and what is made of it is a store of its own.
 
 use super::{Access, Identity, Places, Settled, back_up, restore, verify};
-use crate::clock;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::folder::Folder;
 use midshift_bundle::keys::SecretKey;
@@ -17,6 +16,7 @@ use midshift_ota::content::{Content, DiskContent, Held, Room, Wanted};
 use midshift_ota::folder::{Owner, mark};
 use midshift_ota::repository::{Act, OnlineKeys, Repository, raise_floor};
 use midshift_ota::{OtaService, Parts};
+use midshift_process::clock;
 use midshift_store::{FRAME_BYTES_DEFAULT, Frame, FrameLog, SqliteFrames, SqliteStore, Store, load};
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -257,7 +257,7 @@ async fn a_backup_has_the_files_of_a_stop_service_that_runs_and_none_of_one_that
     let folder = used.places().data.join("stop");
     let parts = midshift_stop::Parts { folder: folder.clone(), site: None, clock: clock::clock(1000) };
     let _service = midshift_stop::StopService::open(parts, Default::default()).expect("opened");
-    fs::write(folder.join(crate::stop::LOG), b"what it said").expect("written");
+    fs::write(folder.join(midshift_core::stop::LOG), b"what it said").expect("written");
     fs::write(folder.join("roster.snapshot.new"), b"half").expect("written");
     let backup = used.backed_up().await;
     let summary = verify(&backup).await.expect("it is good");
@@ -265,7 +265,7 @@ async fn a_backup_has_the_files_of_a_stop_service_that_runs_and_none_of_one_that
     let to = Places { data: used.dir.path().join("restored"), ota_keys: None, store: None };
     restore(&backup, &to, &Access::default(), NOW).await.expect("restored");
     let restored = to.data.join("stop");
-    assert!(!restored.join(crate::stop::LOG).exists(), "a log is nothing to bring back");
+    assert!(!restored.join(midshift_core::stop::LOG).exists(), "a log is nothing to bring back");
     assert_eq!(fs::metadata(&restored).expect("a folder").permissions().mode() & 0o777, 0o700);
     for name in ["latch", "key.pem"] {
         assert_eq!(fs::read(restored.join(name)).expect("it is there"), fs::read(folder.join(name)).expect("as here"));

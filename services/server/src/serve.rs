@@ -1,24 +1,27 @@
 //! `midshift serve`: everything persistent, for a real site: in one process on SQLite or PostgreSQL, or some of the services in each of several
 //! processes on one PostgreSQL database.
 
-use crate::door::{self, Share};
+use crate::changed_map;
 use crate::planning::Planning;
-use crate::server::{Components, Naive, Server};
+use crate::server::Server;
 use crate::storage::{Database, Storage};
-use crate::{backup, changed_map};
-use crate::{clock, clock_doubt, clock_jump, logs, stop, stop_follower};
+use crate::{Components, Naive};
+use crate::{clock_doubt, clock_jump, stop, stop_follower};
 use anyhow::{Context, bail};
 use midshift_agent::tls;
 use midshift_cli::roles::{Role, Roles};
 use midshift_cli::site_file;
 use midshift_core::Boxed;
 use midshift_core::limits;
+use midshift_core::stop::{FOLDER, PORT};
 use midshift_core::time::Clock;
 use midshift_identity::{Duty, IdentityService};
 use midshift_ota::content::Room;
 use midshift_ota::folder::Owner;
 use midshift_ota::rollouts::known_bundles;
 use midshift_ota::{OtaReader, OtaService};
+use midshift_process::door::{self, Share};
+use midshift_process::{clock, logs};
 use midshift_store::Store;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -90,7 +93,7 @@ pub struct Serve {
     #[arg(long, value_name = "ADDR")]
     pub beacon_listen: Option<SocketAddr>,
     /// Where its stop service listens: a process of its own that is started unless one answers there, and that stays when this one ends.
-    #[arg(long, value_name = "ADDR", default_value_t = SocketAddr::from(([127, 0, 0, 1], crate::stop::PORT)))]
+    #[arg(long, value_name = "ADDR", default_value_t = SocketAddr::from(([127, 0, 0, 1], PORT)))]
     pub stop_listen: SocketAddr,
     /// Start no stop service: it runs elsewhere, or under a unit of its own. With --roles none is started either; the role stop-follower belongs beside it.
     #[arg(long, env = "MIDSHIFT_NO_STOP")]
@@ -188,7 +191,7 @@ async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow
     }
     let loaded = load_site(&args)?;
     let clock = clock::clock(1000);
-    crate::recorder::handle();
+    midshift_process::recorder::handle();
     let site_id = loaded.site.site_id().clone();
     let storage = args.database.open(&args.data, site_id, clock.clone()).await?;
     clock_doubt::check_start(&args.data, &*clock, &*storage.store()).await?;
@@ -222,7 +225,7 @@ async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow
         reader,
         sim: None,
         naive: Naive::default(),
-        stops: roles.has(Role::StopFollower).then(|| args.data.join(stop::FOLDER)),
+        stops: roles.has(Role::StopFollower).then(|| args.data.join(FOLDER)),
         stop_port: beside.is_some().then(|| args.stop_listen.port()),
         port: match identity {
             Some(_) => args.share.config("business")?,
@@ -239,7 +242,7 @@ async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow
     let served = tokio::select! {
         served = server.serve(listener) => served,
         () = keep_stop(beside, &*rows) => Ok(()),
-        () = backup::told::run(&args.data, &*rows) => Ok(()),
+        () = midshift_backup::told::run(&args.data, &*rows) => Ok(()),
         () = clock_jump::keep_jumps(&args.data, &*clock) => Ok(()),
         () = clock_doubt::run(&args.data, &*clock, &*rows) => Ok(()),
     };
@@ -284,7 +287,7 @@ fn load_site(args: &Serve) -> anyhow::Result<site_file::Loaded> {
 /// Tells the stop service beside this process whether it may begin with nothing engaged, if this process has its folder.
 async fn announce_first_start(args: &Serve, roles: &Roles, store: &dyn Store) -> anyhow::Result<()> {
     match first_start(args, roles) {
-        Some(occasion) => stop::announce(&args.data.join(stop::FOLDER), store, occasion).await?,
+        Some(occasion) => stop::announce(&args.data.join(FOLDER), store, occasion).await?,
         None if args.init_stop => {
             bail!("--init-stop is for a process with role stop-follower, which has the stop service's folder")
         }
@@ -416,7 +419,7 @@ async fn start_stop(
     if args.no_stop || roles.are_split() {
         return Ok(None);
     }
-    let folder = args.data.join(stop::FOLDER);
+    let folder = args.data.join(FOLDER);
     stop_follower::tell_stops(&folder, store).await.context("telling the stop service what is engaged")?;
     if let Some(identity) = identity {
         stop_follower::tell_principals(&folder, identity).context("telling the stop service who is known")?;

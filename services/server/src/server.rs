@@ -5,11 +5,10 @@
 //! whole server with it: none is served without the others. A gateway among several first says that it is not ready and lets its robots
 //! move over.
 
-pub use crate::components::{Components, Naive};
-use crate::door::{self, Login};
+use crate::components::Components;
+use crate::denials;
 use crate::housekeeping;
 use crate::stop_follower::StopFollower;
-use crate::{denials, recorder};
 use anyhow::{Context, bail};
 use axum::routing::get;
 use http::StatusCode;
@@ -21,6 +20,8 @@ use midshift_edge::{Denials, Listen, Listener};
 use midshift_fleet::{FleetService, Reconciler};
 use midshift_identity::audit::AuditService;
 use midshift_ota::rollouts::{Planner, RolloutService};
+use midshift_process::door::{self, Login};
+use midshift_process::recorder;
 use midshift_proto::sim::v1::sim_service_server;
 use midshift_store::LiveBoard;
 use midshift_task::TaskService;
@@ -427,12 +428,15 @@ async fn publish_health(health: &HealthReporter, names: BTreeSet<&'static str>, 
 mod frames;
 #[cfg(test)]
 mod tests {
+    mod old_connections;
+
     use super::*;
-    use crate::clock;
+    use crate::Naive;
     use crate::planning::Planning;
     use midshift_cli::roles::Roles;
     use midshift_cli::site_file;
     use midshift_ota::OtaService;
+    use midshift_process::clock;
     use midshift_store::{MemoryFrames, MemoryStore, StoreId};
     use tokio::net::TcpListener;
     use tokio::task::JoinHandle;

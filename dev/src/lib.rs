@@ -18,10 +18,6 @@ pub mod throwaway;
 
 pub use args::Dev;
 
-use crate::planning::Planning;
-use crate::serve::{self, Say};
-use crate::server::{Components, Naive, Server};
-use crate::{changed_map, clock, door};
 use anyhow::{Context, bail};
 use greeting::greeting;
 use midshift_agent::trust::Trust;
@@ -30,6 +26,11 @@ use midshift_cli::site_file::{self, Loaded};
 use midshift_core::Boxed;
 use midshift_core::site::{Site, grid};
 use midshift_core::time::Clock;
+use midshift_process::{clock, door};
+use midshift_server::changed_map;
+use midshift_server::planning::Planning;
+use midshift_server::serve::{self, Say};
+use midshift_server::{Components, Naive, Server};
 use midshift_sim::faults::FaultRates;
 use midshift_sim::fleet::{Fleet, FleetConfig, Persistence};
 use midshift_sim::service::SimFace;
@@ -87,7 +88,7 @@ async fn play(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Resul
     let site = site_of(&args, &loaded)?;
     // Journals of several processes are judged by one clock, so a story's is real and its bodies are fast.
     let clock = clock::clock(if scene.is_some() { 1000 } else { (args.speedup * 1000.0) as u32 });
-    crate::recorder::handle();
+    midshift_process::recorder::handle();
     let hall_config = hall_config(&args, &site, scene.as_ref());
     let hall = Arc::new(Fleet::open(&hall_config, &clock.now())?);
     let listener = TcpListener::bind(args.listen)

@@ -269,6 +269,10 @@ fn differences(list: &BTreeMap<String, Kept>, found: &BTreeMap<String, Kept>) ->
 }
 
 #[cfg(test)]
+#[path = "../../../tests/src/postgres.rs"]
+#[expect(dead_code, reason = "other tests need more of it")]
+mod postgres_server;
+#[cfg(test)]
 mod postgres_tests;
 #[cfg(test)]
 mod tests;
