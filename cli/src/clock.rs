@@ -1,12 +1,10 @@
 //! Leaves a person's word that the wall clock of this machine is right.
 
 use anyhow::Context;
+use midshift_core::wall_clock::ACCEPTED;
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
-
-/// The file of the data folder that is the word.
-pub const ACCEPTED: &str = "clock-accepted";
 
 /// Leaves the word for the server of `data`.
 ///

@@ -57,11 +57,11 @@ impl Found {
     }
 }
 
-/// The whole id behind what was typed, by what the server lists. What nothing begins with stays as it is: the call that follows says
-/// that there is no such thing. So does what a caller names that may not list.
+/// Completes an id from its beginning, by the ids that the server lists. Returns `typed` unchanged if no id begins with
+/// it, or if the caller may not list: the next call reports an unknown id.
 ///
 /// # Errors
-/// If several begin with it, or the server does not answer.
+/// If `typed` is empty, several ids begin with it, or the server does not answer.
 pub async fn whole_id(
     what: &str,
     typed: &str,

@@ -13,7 +13,7 @@ pub mod gates;
 pub mod idempotency;
 pub mod identity;
 pub mod ids;
-pub mod lead;
+pub mod leadership;
 pub mod limits;
 pub mod maintenance;
 pub mod nearest;
@@ -31,7 +31,7 @@ pub mod task;
 pub mod time;
 pub mod unknown_rows;
 pub mod update;
-pub mod wall;
+pub mod wall_clock;
 pub mod work;
 
 use std::pin::Pin;

@@ -25,7 +25,7 @@ pub struct DrainRequest {
     pub within_ms: u64,
     /// The robot gets no work from now on, whatever the area's budget.
     pub urgent: bool,
-    /// The robot goes back from what was aborted: it waits for others that change, and for nobody whom only a person brings back.
+    /// The robot leaves aborted software. Its drain waits only for other drains that end without a person.
     #[serde(default)]
     pub returns: bool,
     /// The robot changes to something new: while the area's window is shut or the area is frozen its drain does not begin.

@@ -123,7 +123,7 @@ pub struct Now {
     pub jump: Option<Jump>,
 }
 
-/// Where a service or an agent reads the time. Implemented by the binary over tokio's clock, so that a simulation can own it.
+/// Where a service or an agent reads the time. Implemented by the programs over tokio's clock, so that a simulation can own it.
 pub trait Clock: Send + Sync + 'static {
     /// All clocks at one moment.
     fn now(&self) -> Now;
@@ -151,7 +151,7 @@ pub trait Clock: Send + Sync + 'static {
 }
 
 /// Clocks of a simulation: a monotonic source in microseconds, a UTC base, and a rate. Their wall never jumps; that of a machine may, see
-/// [`crate::wall::WallClock`].
+/// [`crate::wall_clock::WallClock`].
 ///
 /// Scaled site time is advanced by reading it. If nobody read it for more than 2 s of site time the loop has fallen
 /// behind, and the site clock slows instead of jumping: [`ScaledClock::site_elapsed_ms`] against the link clock gives the rate

@@ -1,8 +1,8 @@
 //! `midshift dev`: a whole factory in one process, in memory, on loopback, with simulated robots and work of its own.
 //! Not for production.
 //!
-//! Invariant: its one door is [`run`]; what the rooms below tell each other goes through none of the server's own
-//! files.
+//! Invariant: its one door is [`run`], and what the rooms below tell each other goes through none of the server's own
+//! files. Tests alone use [`task_summary`] and [`throwaway`].
 
 mod args;
 mod background;

@@ -5,8 +5,8 @@ use anyhow::Context;
 use midshift_core::site::Site;
 use midshift_core::stop::{FOLDER, PORT};
 use midshift_core::time::Clock;
-use midshift_server::stop::{self, Beside};
 use midshift_server::stop_follower;
+use midshift_server::stop_service::{self, Beside};
 use midshift_store::Store;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -42,7 +42,7 @@ impl Stops {
                 (temporary.path().join(FOLDER), Some(temporary))
             }
         };
-        stop::announce(&folder, store, stop::Occasion::Start).await?;
+        stop_service::announce(&folder, store, stop_service::Occasion::Start).await?;
         stop_follower::tell_stops(&folder, store).await?;
         let beside = Beside::start(folder.clone(), site, clock, listener)?;
         Ok(Self { beside, folder, _temporary: temporary })

@@ -4,7 +4,7 @@
 //! Called by programs, at their start.
 
 use midshift_core::time::{Clock, Jump, Utc};
-use midshift_core::wall::WallClock;
+use midshift_core::wall_clock::WallClock;
 use std::fs;
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};

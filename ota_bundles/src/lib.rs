@@ -1,9 +1,14 @@
-//! What a signed bundle is: how release people build and sign one, and how a robot decides whether to believe it.
+//! Builds, signs and verifies software bundles: for release people, for the rollout service, and for robots.
 //!
-//! Rooms: `manifest` and `build` make a bundle of a draft; `keys`, `repository` and `directive` sign, and `key_set` says with which keys directives are; `roots` changes who signs; `folder` is where they keep it;
-//! `encoding` makes files shorter on their way, and `ways` names them; `freshness` is what a server must know of documents that others signed; `trust` is what a robot believes, and `release`
-//! what it keeps of that.
-//! Called by the command line, by the rollout service and by agents. Invariant: nothing here runs, installs or downloads anything.
+//! Modules:
+//! 1. `build` makes a bundle of a draft; `manifest` lists its components.
+//! 2. `keys`, `repository` and `directive` sign. `key_set` names the keys that sign directives; `roots` changes root
+//!    keys.
+//! 3. `folder` stores the repository of release people. `encoding` compresses files and makes patches; `ways` names
+//!    these.
+//! 4. `freshness` checks documents on the server. `trust` verifies them on a robot; `release` keeps the verified ones.
+//!
+//! Invariant: nothing here runs, installs or downloads anything.
 
 pub mod bugs;
 pub mod build;

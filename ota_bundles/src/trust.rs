@@ -335,14 +335,19 @@ impl Trusted {
     /// Why nothing else is believed, with the new root.
     pub async fn refresh_or_root(&self, source: Arc<dyn Source>, clock: Reading) -> Result<Refreshed, Unrefreshed> {
         let heard = Arc::new(Mutex::new(Heard::new()));
-        let asked = self.ask(source, clock, heard.clone()).await;
+        let asked = self.load_verified(source, clock, heard.clone()).await;
         asked.map_err(|error| {
             let heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
             Unrefreshed { error, rooted: self.rooted(&heard).map(Box::new) }
         })
     }
 
-    async fn ask(&self, source: Arc<dyn Source>, clock: Reading, heard: Arc<Mutex<Heard>>) -> Result<Refreshed, Error> {
+    async fn load_verified(
+        &self,
+        source: Arc<dyn Source>,
+        clock: Reading,
+        heard: Arc<Mutex<Heard>>,
+    ) -> Result<Refreshed, Error> {
         let store = |source| Error::Store { doing: "unpacking", source };
         let folder = tempfile::tempdir().map_err(store)?;
         for (name, document) in
@@ -369,10 +374,15 @@ impl Trusted {
             .await
             .map_err(|e| Error::Metadata(Box::new(e)))?;
         let heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
-        self.believe(&repository, &heard, clock)
+        self.check_freshness(&repository, &heard, clock)
     }
 
-    fn believe(&self, repository: &tough::Repository, heard: &Heard, clock: Reading) -> Result<Refreshed, Error> {
+    fn check_freshness(
+        &self,
+        repository: &tough::Repository,
+        heard: &Heard,
+        clock: Reading,
+    ) -> Result<Refreshed, Error> {
         let old = parsed(&self.root)?;
         let (root, timestamp) = (repository.root(), repository.timestamp());
         let (snapshot, targets) = (repository.snapshot(), repository.targets());

@@ -7,7 +7,7 @@ use midshift_core::reason::{Code, Kind, Refusal};
 use std::fmt;
 use std::sync::Arc;
 
-/// Whoever is told.
+/// Receives the denials of one request, to record them.
 pub trait Told: Send + Sync {
     /// One request was denied for who asked.
     fn denied(&self, refusal: &Refusal);

@@ -1,11 +1,16 @@
-//! What a robot runs: the session to the server, the ring of samples, the ledger of work, the governor, and the body it
-//! drives.
+//! The agent of a robot: its session to the server, its stored samples and work, its governor, and its body.
 //!
-//! A maker implements [`body::Body`] and calls [`run`]; `examples/own_robot.rs` does. Rooms, from below: `launcher`
-//! starts the program and owns the switch record; `sets` is software on the disk; `storage` is what is remembered;
-//! `transport` are the ways to servers; `stop` and `update` are beside the core, which decides; `session` is the shell
-//! around the core, and `program` a robot's process. Each uses only those before it. Invariant: a buffered message
-//! never starts the body, and a finished task is never done again.
+//! A maker implements [`body::Body`] and calls [`run`], as `examples/own_robot.rs` does. Modules, from the lowest to
+//! the highest; each uses only those before it:
+//! 1. `launcher` starts the program and owns the switch record.
+//! 2. `sets` keeps software on the disk.
+//! 3. `storage` keeps the ledger and the ring of samples.
+//! 4. `transport` connects to servers.
+//! 5. `stop` and `update` do what fleet stops and updates need outside the core.
+//! 6. `core` decides, without IO.
+//! 7. `session` is the shell around the core, and `program` is a robot's process.
+//!
+//! Invariant: a buffered message never starts the body, and a finished task is never done again.
 
 pub mod body;
 pub mod bugs;

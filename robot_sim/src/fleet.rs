@@ -2,7 +2,7 @@
 //! came of it.
 //!
 //! Invariant: with everything in memory all bodies share one world and one journal; in a directory each body has its
-//! own, so that its process may die alone. Called by the swarm, the simulator's service and the binary's report.
+//! own, so that its process may die alone. Called by the swarm, the simulator's service and the report of `dev`.
 
 use crate::body::{self, BodyConfig, Counts, JOURNAL_FILE, SimBody};
 use crate::faults::{FaultRates, Injected};

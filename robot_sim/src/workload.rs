@@ -1,6 +1,6 @@
 //! Seeded work for a site: transports between its stations, and when the next one comes.
 //!
-//! Invariant: the same seed and site give the same work. It submits nothing; the binary's client does.
+//! Invariant: the same seed and site give the same work. It submits nothing; the client of `dev` does.
 
 use midshift_core::ids::WaypointId;
 use midshift_core::site::Site;

@@ -92,7 +92,7 @@ pub fn check(
 fn may_be_there(board: &Board, now: &Now, holder: &PlaceHolder) -> bool {
     match liveness::presence(board, &holder.robot_id, now) {
         Presence::Online => true,
-        Presence::Suspect | Presence::Updating => holder.state != HolderState::Inside,
+        Presence::Suspect => holder.state != HolderState::Inside,
         Presence::Offline => false,
     }
 }
@@ -284,7 +284,7 @@ pub fn apply(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
             tx.put_row(RobotControl { labels, ..control }, "robot.labeled");
         }
         Command::Drain { robot_id, reason, within_ms } => drain::ask(tx, robot_id, reason, actor, *within_ms),
-        Command::Undrain { robot_id } => drain::release(tx, robot_id),
+        Command::Undrain { robot_id } => drain::undrain(tx, robot_id),
         Command::PutPolicy(policy) => {
             tx.put_row(policy.clone(), "area.policy_put");
         }

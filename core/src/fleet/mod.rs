@@ -1,17 +1,18 @@
-//! The law of the fleet: who gets which task, who may enter which place, what a heartbeat repairs, and why not now.
+//! Plans the fleet: assigns tasks, grants places, repairs rows from heartbeats, and explains what waits.
 //!
-//! [`cycle`] takes what happened and gives items to commit and a report; the service around it only reads, commits and publishes.
-//! Rooms, from the lowest to the highest; each uses only those before it:
-//! 1. [`projection`]: what is known.
-//! 2. [`decision`]: how a decision becomes an item.
-//! 3. [`tasks`]: what moves a task or an attempt, and what a robot's word is worth.
-//! 4. [`traffic`]: places, routes, and what each robot is told.
-//! 5. [`facts`]: what happened, and what follows of it.
-//! 6. [`assignment`]: which robot gets which task or errand.
-//! 7. [`maintenance`]: who is out of work.
-//! 8. [`explanation`]: why, and why not.
+//! [`cycle`] turns new facts into items to commit and a report. The service around it reads, commits and publishes.
+//! Modules, from the lowest to the highest; each uses only those before it:
+//! 1. [`projection`]: rows by table, indices derived from them, and memory of this process.
+//! 2. [`decision`]: turns one decision into one item, limits a turn, reports it, opens incidents.
+//! 3. [`tasks`]: moves tasks and attempts by their table, and checks what robots claim.
+//! 4. [`traffic`]: routes, grants of places, and the desired work of each robot.
+//! 5. [`facts`]: applies feed entries, heartbeats, requests, stops, and what is due by time.
+//! 6. [`assignment`]: picks a robot for each task and each errand.
+//! 7. [`maintenance`]: takes robots out of work and gives them back.
+//! 8. [`explanation`]: says what a task or a robot waits for.
 //!
-//! `commands` are what people ask directly, `bugs` are naive rules for twins of tests. Rooms that other crates use are named here once more.
+//! `commands` carries out direct requests of people. `bugs` holds deliberately naive rules, with which a test shows
+//! what the real rule prevents. Modules that other crates use are re-exported here.
 //! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod assignment;
@@ -44,7 +45,7 @@ pub use tasks::load;
 pub use traffic::starts;
 
 use crate::ids::RobotId;
-use crate::lead::Rivals;
+use crate::leadership::Rivals;
 use crate::time::Now;
 use assignment::{assign, errands, readiness};
 use decision::plan::mark;
@@ -54,7 +55,7 @@ use maintenance::{budget, drain};
 use projection::rows::{Place, RobotAuthority, RobotControl, RobotHolder, ServiceClock, SiteRow};
 use projection::state::FleetProjection;
 use tasks::arrivals;
-use traffic::{closures, desired, serve};
+use traffic::{allocation, closed_places, desired};
 
 /// Who else may plan on a store that other processes open too, or not.
 pub fn rivals(is_shared: bool, bugs: bugs::Bugs) -> Rivals {
@@ -137,7 +138,7 @@ pub fn cycle(view: &mut FleetProjection, now: Now, board: &Board, pace: Pace, pl
         stops::plan(view, board, now, plan);
     }
     plan.slice.renew();
-    drain::obey(view, now, plan);
+    drain::apply_requests(view, now, plan);
     plan.slice.renew();
     budget::plan(view, board, now, plan);
     plan.slice.renew();
@@ -152,14 +153,14 @@ pub fn cycle(view: &mut FleetProjection, now: Now, board: &Board, pace: Pace, pl
     errands::plan(view, board, now, idle, plan);
     plan.slice.renew();
     write_down(view, now, board, &desired::Releases::default(), plan);
-    let releases = serve::serve_requests(view, board, now, plan);
+    let releases = allocation::allocate_places(view, board, now, plan);
     plan.slice.renew();
     write_down(view, now, board, &releases, plan);
     if pace == Pace::Sweep {
         plan.slice.renew();
         unexplained::count_unexplained(view, board, now, plan);
         lasting::tell_lasting(view, board, now, plan);
-        closures::tell_closed(view, now, plan);
+        closed_places::keep_incidents(view, now, plan);
         misreads::close_understood(view, board, now, plan);
     }
     if !plan.items.is_empty() {

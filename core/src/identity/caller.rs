@@ -7,7 +7,7 @@ use crate::reason::{Code, Kind, Reason, Refusal};
 use std::fmt;
 use std::sync::Arc;
 
-/// Who asks.
+/// The identity of a caller.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Who {
     /// Somebody who showed nothing.
@@ -25,7 +25,7 @@ pub enum Who {
     },
 }
 
-/// Who asks, with its rights. In the extensions of each request that came through a port.
+/// The caller of a request, with its rights. Stands in the extensions of each request that came through a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Caller {
     who: Who,
@@ -76,7 +76,7 @@ impl Caller {
     pub const fn named_person(&self) -> Option<&Arc<str>> {
         self.person.as_ref()
     }
-    /// Who stands behind it: what two of them are compared by where a second person is asked for.
+    /// The person of its token, else its own name. Two callers are compared by it where a second person is asked for.
     pub fn person(&self) -> String {
         self.person.as_ref().map_or_else(|| self.to_string(), ToString::to_string)
     }

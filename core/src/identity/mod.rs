@@ -1,7 +1,11 @@
-//! Who may do what: roles and where they hold, callers, and what is known of tokens and keys.
+//! Access rights: roles and their scopes, callers, and the rows of tokens, keys and enrolments.
 //!
-//! Invariant: rights are never merged. A right holds where the one grant that gives it says, and a caller without a grant may do nothing.
-//! Secrets are never here, only their digests. Called by the edge of every port, by identity, and by services for each object.
+//! Invariants:
+//! 1. Rights are never merged. A right holds only in the scope of the one grant that gives it.
+//! 2. A token without a grant permits nothing beyond what is open to anybody.
+//! 3. Rows hold digests of secrets, never the secrets.
+//!
+//! Called by the edge of every port, by identity, and by services for each object.
 
 mod actor;
 mod caller;

@@ -89,7 +89,7 @@ fn plan_all(
                 return true;
             }
             moves += 1;
-            plan.decide(view, now, "ota", |tx| moves::make(tx, sign, board, &id, due));
+            plan.decide(view, now, "ota", |tx| moves::apply(tx, sign, board, &id, due));
         }
     }
     for id in open {

@@ -1,19 +1,19 @@
-//! The law of roll-outs: which robot gets which bundle when, what counts for and against it, and the way back.
+//! Plans roll-outs: which robot takes which bundle and when, how each is judged, and how robots go back.
 //!
-//! [`cycle()`] takes what happened and gives items to commit; the service around it only reads, signs, commits and
-//! publishes. Rooms, from the lowest to the highest; each uses only those before it:
-//! 1. [`projection`]: what is asked for, and what is known.
-//! 2. [`decision`]: how a decision becomes an item, and what a directive says.
-//! 3. [`members`]: which robots belong to a roll-out, in which wave, and what robots get that come later.
-//! 4. [`judgement`]: what counts for and against a bundle, and how a roll-out ends.
-//! 5. [`robots`]: what is due for each robot, where that leads, and what is written for it.
-//! 6. [`phases`]: waves, gates, pauses, and the way back of the whole.
-//! 7. [`facts`]: what happened: entries of the feed, and what robots say.
-//! 8. [`commands`]: what people ask.
+//! [`cycle()`] turns new facts into items to commit. The service around it reads, signs, commits and publishes.
+//! Modules, from the lowest to the highest; each uses only those before it:
+//! 1. [`projection`]: requests, rows by table, and indices derived from them.
+//! 2. [`decision`]: turns one decision into one item, and composes directives.
+//! 3. [`members`]: assigns robots to roll-outs and waves, and bundles to robots that come later.
+//! 4. [`judgement`]: weighs what speaks for and against a bundle, and decides how a roll-out ends.
+//! 5. [`robots`]: finds and writes the next move of each robot.
+//! 6. [`phases`]: moves a roll-out through waves, gates and pauses, and takes it back.
+//! 7. [`facts`]: applies feed entries and the reports of robots.
+//! 8. [`commands`]: checks and carries out requests of people.
 //!
-//! On top of them `explain` says what a robot waits for, and `bugs` are naive rules for twins of tests. Files that
-//! other crates use are named here once more. Invariant: no IO, no clock, no hash-map order; the same inputs give the
-//! same items.
+//! `explain` says what a robot waits for. `bugs` holds deliberately naive rules, with which a test shows what the real
+//! rule prevents. Items that other crates use are re-exported here.
+//! Invariant: no IO, no clock, no hash-map order; the same inputs give the same items.
 
 pub mod bugs;
 pub mod commands;
@@ -40,7 +40,7 @@ pub use facts::feed::{LOGS, absorb, follow_rows, obeyed, reread, tell_damaged};
 pub use judgement::verdict;
 pub use projection::{ended, requests, retention, rows, spec, timestamp};
 
-use crate::lead::Rivals;
+use crate::leadership::Rivals;
 
 /// Who else may plan on a store that other processes open too, or not.
 pub fn rivals(is_shared: bool, bugs: bugs::Bugs) -> Rivals {

@@ -2,7 +2,7 @@
 //!
 //! Invariant: a free cell is one waypoint `c<row * width + column>` joined to its free neighbours in four directions, 1 m
 //! apart, at 1 m/s; nothing is reserved on a grid, and bodies drive through each other (`collisions_modelled` is false).
-//! Called by the binary for `--map` and `--tasks`, and by the bench.
+//! Called by the command line for `--map` and `--tasks`, and by the bench.
 
 use super::draft::{Draft, DraftArea, DraftLane, DraftWaypoint};
 use super::map::{AreaDefaults, Kind, Site, Source, WaypointIx};

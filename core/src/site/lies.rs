@@ -1,6 +1,6 @@
-//! In which areas things lie, for whoever may do something in some of them only.
+//! Finds the areas in which waypoints, tasks and places lie, to check rights that hold in some areas only.
 //!
-//! Invariant: nothing lies in fewer areas than it does. What cannot be found on the map lies in none, and that makes it the site's.
+//! Invariant: no area is left out. What is not on the map lies in no area, and so needs a right over the whole site.
 
 use super::{PlaceIx, Site};
 use crate::ids::{AreaId, PlaceId, WaypointId};

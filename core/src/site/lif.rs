@@ -1,7 +1,7 @@
 //! Import of VDMA LIF, the Layout Interchange Format for driverless transport systems (JSON, version 1.0.0; lengths in metres).
 //!
 //! Invariant: what the format can say and a [`Site`] cannot (curves, orientations, per-vehicle rules) is named in a warning,
-//! never silently dropped; a node, edge or station that contradicts itself is a violation. Called by the binary for `--map`.
+//! never silently dropped; a node, edge or station that contradicts itself is a violation. Called by the command line for `--map`.
 
 use super::draft::{Draft, DraftArea, DraftLane, DraftWaypoint};
 use super::grid::site_id_of;

@@ -1,7 +1,7 @@
 //! What is wrong with a map before a robot finds out: dead ends, ways where two must meet, too few places to wait.
 //!
 //! Invariant: a finding is of severity [`Severity::Error`] only for an authored site, which is refused then; imports are
-//! only warned about. Called by `map lint`, and by the binary before it serves a site.
+//! only warned about. Called by `map lint`, and by `serve` before it serves a site.
 
 use super::{Area, AreaIx, Kind, Lane, Place, PlaceKind, Site, Source, WaypointIx};
 use crate::limits;

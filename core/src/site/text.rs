@@ -1,6 +1,6 @@
 //! The site format: TOML that a person can write, read with every mistake listed at once, and written back.
 //!
-//! Invariant: `parse(render(site)) == site`; an unknown key is a mistake. Called by the binary and by tests.
+//! Invariant: `parse(render(site)) == site`; an unknown key is a mistake. Called by `server` and by tests.
 //!
 //! What may stand in a file is told in docs/sites.md, whose example is read here.
 

@@ -1,10 +1,12 @@
-//! Fleet stop: the law that the stop service and every robot share. An operational stop request, not a safety function.
+//! Fleet stop: the rules that the stop service and every robot share. An operational request, not a safety function.
 //!
-//! A stop is named, engaged once and reset by its name. Both are facts that only add up ([`latch`]), so it does not matter in which order, how
-//! often or by which way a robot hears of them. Who lies inside a stop decides each robot by its own pose ([`region`]); who hears nothing slows
-//! down and stands by itself ([`ladder`]); what all of it comes to for one robot is [`robot`], and what people are shown of it [`roster`].
+//! A stop is engaged once and reset once, by its name. Both facts only accumulate ([`latch`]), so their order, number
+//! and path to a robot do not matter. Each robot decides by its own pose whether it lies inside a stop ([`region`]). A
+//! robot that hears nothing slows down, then stands ([`ladder`]). [`robot`] computes the level that one robot obeys;
+//! [`roster`] computes what people are shown of it.
 //!
-//! Invariant: nothing here makes a robot move that stood. A reset takes a stop away and leaves `resume:<id>`; only a person's resume ends that.
+//! Invariant: nothing here moves a robot that stands. A reset ends a stop and leaves `resume:<id>`, which only a
+//! person's resume removes.
 //! Absent on purpose: the store, the task queue, a level that cuts power.
 
 pub mod hung;

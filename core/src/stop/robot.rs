@@ -106,8 +106,10 @@ impl RobotStop {
         is_new
     }
 
-    /// Somebody beside the stop service has said what it knows. Stops count whoever says them. A reset counts if it `is_marked` by the stop service and not
-    /// older than its stop. What is not said is not over, and nothing of it says that all was told. Whether it is new.
+    /// Takes stops and resets from a sender other than the stop service. Returns whether anything is new.
+    /// 1. Every stop counts.
+    /// 2. A reset counts if `is_marked` confirms the stop service's mark and it is not older than its stop.
+    /// 3. Absence proves nothing: a missing stop is not over, and `is_told` stays as it was.
     pub fn told_beside(&mut self, stops: Vec<Stop>, resets: Vec<Reset>, is_marked: impl Fn(&Reset) -> bool) -> bool {
         let engaged = self.told(stops, Vec::new());
         let latch = &self.kept.latch;

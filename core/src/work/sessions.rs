@@ -160,7 +160,9 @@ impl PresenceRow {
         let words = live.report.conditions().into_iter();
         words.map(|what| Condition { since_unix_ms: since(&what).unwrap_or(live.received_unix_ms), what }).collect()
     }
-    /// Since when nobody has heard the robot, where nobody who runs now has: at the earliest since it was noted last that it was heard.
+    /// When the robot was last known to be heard, for a server that has not heard it itself. UTC of the wall, unix ms.
+    /// Unless the row says OFFLINE, it is the receipt of the heartbeat kept in it; else the moment since which
+    /// `presence` holds.
     pub fn unheard_since_unix_ms(&self) -> i64 {
         let heard = self.last_heard.as_ref().filter(|_| self.presence != Presence::Offline);
         heard.map_or(self.since_unix_ms, |heard| heard.at_unix_ms)

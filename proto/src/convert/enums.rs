@@ -72,7 +72,7 @@ wire_enums! {
         Directed = Directed, Downloading = Downloading, Staged = Staged, Switching = Switching, Probation = Probation, Trial = Trial,
         Committing = Committing, RollingBack = RollingBack, Committed = Committed, RolledBack = RolledBack, Refused = Refused, Stuck = Stuck,
     }
-    Presence = telemetry::v1::Presence { Online = Online, Suspect = Suspect, Offline = Offline, Updating = Updating }
+    Presence = telemetry::v1::Presence { Online = Online, Suspect = Suspect, Offline = Offline }
     Duty = fleet::v1::Duty { InWork = InWork, Cordoned = Cordoned, BrokenOff = BrokenOff, Retired = Retired }
     RolloutPhase = ota::v1::RolloutPhase {
         Draft = Draft, Validated = Validated, Approved = Approved, Prefetching = Prefetching, Applying = Applying, Soaking = Soaking, Gate = Gate,

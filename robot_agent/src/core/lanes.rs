@@ -1,9 +1,13 @@
-//! The sending side of the lanes: what goes up next, how much may be under way, and what an answer of the server means.
+//! Sends the lanes: picks the next batch, limits what is unacknowledged, and applies the server's answers.
 //!
-//! Invariant: a sample is sent only after it is durable, in order, and after a break again from what the server has.
-//! CRITICAL and EVENT need no credit. STATUS has one way at a time: what gathered before the session goes over bulk,
-//! and only then what came since goes on the session; a little of it, or what bulk does not take, goes on the session
-//! too, with at most a quarter of the credit.
+//! Invariants:
+//! 1. A sample is sent only after it is durable, and in order. After a reconnect, sending goes on from what the server
+//!    has.
+//! 2. CRITICAL and EVENT need no credit.
+//! 3. STATUS takes one path at a time. What gathered before the session goes over bulk; only then newer STATUS goes on
+//!    the session.
+//! 4. A backlog of at most [`limits::REPLAY_ON_LINK_MAX`], or one that bulk does not take, goes on the session, with at
+//!    most a quarter of the credit.
 
 use crate::storage::ring::{Item, Ring};
 use midshift_core::limits;

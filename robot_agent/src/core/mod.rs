@@ -1,9 +1,9 @@
-//! The agent without IO: `step(now, input)` decides, drives the body, and says what to keep and what to send.
+//! The agent's decisions without IO: `step(now, input)` drives the body and returns what to store and to send.
 //!
-//! Rooms, from below: `interface` is what passes between it and the shell; `work`, `load`, `places`, `lanes`,
-//! `throttle` and `governor` are values with their rules; `state` is what it knows; `attempt`, `drive`, `offer`,
-//! `stops`, `installed` and `update` decide; `step` is on top. Invariant: no clock, no randomness, no waiting. Called
-//! by the shell ([`crate::session`]) and by simulations.
+//! Modules, from the lowest to the highest: `interface` defines inputs and outputs. `work`, `load`, `places`, `lanes`,
+//! `throttle` and `governor` are values with their rules. `state` holds them all. `attempt`, `drive`, `offer`, `stops`,
+//! `installed` and `update` decide. `step` dispatches one input.
+//! Invariant: no clock, no randomness, no waiting. Called by the shell ([`crate::session`]) and by simulations.
 
 mod attempt;
 mod drive;

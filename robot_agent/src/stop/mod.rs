@@ -1,8 +1,8 @@
-//! Fleet stop beside the core: what a robot was told, what it says of that, and what must be kept.
+//! Connects a robot to the stop service: receives stops, stores them, and reports them in check-ins.
 //!
-//! Rooms: `messages` is what passes on the line, `known` what the robot knows and when it must say something; `line` is
-//! the shell's connection to the stop service, `keep` the file. What the body does about it is the core's. Invariant: a
-//! stop is obeyed before it is written or answered.
+//! Modules: `messages` defines what passes on the line. `known` holds the robot's stops and decides when to check in.
+//! `line` is the connection of the shell, `keep` the file. The core decides what the body does.
+//! Invariant: a stop is obeyed before it is written or answered.
 
 pub mod keep;
 mod known;

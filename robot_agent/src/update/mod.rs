@@ -1,8 +1,9 @@
-//! The robot's updates beside the core: the jobs and who does them, what it believes, and the way to the repository.
+//! Carries out software updates for the core: its jobs, its trust in signatures, and its access to the repository.
 //!
-//! Rooms: `jobs` is what the core asks for, `updater` what it knows meanwhile, `trust` what it believes from its first
-//! day; `io` does the jobs, `remote` asks the server, `migration` calls a committed program; `retry` says how long is
-//! waited for what failed. Invariant: nothing is decided here. The core's room `update` decides.
+//! Modules: `jobs` defines what the core asks for. `updater` holds volatile state; `trust` holds what the robot trusts
+//! from its first day. `io` does the jobs, `remote` calls the server, `migration` calls a committed program. `retry`
+//! computes how long to wait after a failure.
+//! Invariant: nothing is decided here. The core's module `update` decides.
 
 pub mod io;
 mod jobs;

@@ -11,9 +11,9 @@ mod identity;
 mod keys;
 mod part;
 mod parts;
-mod place;
 mod releases;
 mod rows;
+mod staging;
 mod stops;
 pub mod told;
 
@@ -27,8 +27,8 @@ use midshift_store::{PostgresRestore, RestoreError, StoreId};
 pub use part::{KEYS, Places};
 use part::{Making, POSTGRES, Said};
 use parts::PARTS;
-use place::Place;
 use serde::{Deserialize, Serialize};
+use staging::Staging;
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -82,7 +82,7 @@ pub struct Summary {
 /// If something cannot be read or written. Nothing is left at `to` then.
 pub fn back_up<'a>(from: &'a Places, to: &'a Path, now: Utc) -> Boxed<'a, anyhow::Result<Summary>> {
     Box::pin(async move {
-        let place = Place::new(to)?;
+        let place = Staging::new(to)?;
         let mut names = Vec::new();
         let mut said = Said::default();
         for part in PARTS {
@@ -160,7 +160,7 @@ pub fn restore<'a>(
             _ => {}
         }
         ensure!(now >= summary.begun, "this machine's clock is before the moment of the backup; set it first");
-        let place = Place::new(&to.data)?;
+        let place = Staging::new(&to.data)?;
         // Keys that do not go into the data directory are made whole beside their own place.
         let mut keys = None;
         let mut within = Places { data: place.path().to_owned(), ota_keys: None, store: to.store.clone() };
@@ -168,7 +168,7 @@ pub fn restore<'a>(
             ensure!(summary.has(KEYS), "the backup has no online keys");
             within.ota_keys = Some(match folder.strip_prefix(&to.data) {
                 Ok(inside) => place.path().join(inside),
-                Err(_) => keys.insert((Place::new(folder)?, folder.clone())).0.path().to_owned(),
+                Err(_) => keys.insert((Staging::new(folder)?, folder.clone())).0.path().to_owned(),
             });
         }
         let mut making = Making { places: within, store_id: StoreId::fresh(), now, rows: None };
@@ -187,7 +187,10 @@ pub fn restore<'a>(
 }
 
 /// Gives folders their names and commits the rows last: they alone make a server of it, and a folder without them belongs to no store.
-async fn name_all(places: impl Iterator<Item = (Place, PathBuf)>, rows: Option<PostgresRestore>) -> anyhow::Result<()> {
+async fn name_all(
+    places: impl Iterator<Item = (Staging, PathBuf)>,
+    rows: Option<PostgresRestore>,
+) -> anyhow::Result<()> {
     let mut named = Vec::new();
     let named_all = async {
         for (place, folder) in places {
@@ -272,7 +275,5 @@ fn differences(list: &BTreeMap<String, Kept>, found: &BTreeMap<String, Kept>) ->
 #[path = "../../../tests/src/postgres.rs"]
 #[expect(dead_code, reason = "other tests need more of it")]
 mod postgres_server;
-#[cfg(test)]
-mod postgres_tests;
 #[cfg(test)]
 mod tests;

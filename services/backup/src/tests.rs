@@ -1,5 +1,7 @@
 //! A backup is whole, says when it is not, and what is made of it is a store of its own.
 
+mod postgres;
+
 use super::{Access, Identity, Places, Settled, back_up, restore, verify};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::folder::Folder;

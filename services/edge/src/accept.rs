@@ -1,10 +1,12 @@
-//! Accepting without spinning: what an error of accept means, and how long to wait after it.
+//! Accepts connections without spinning: sorts the errors of accept(2), and pauses when the process lacks resources.
 //!
-//! Invariant: out of descriptors or memory the loop pauses, each pause twice the one before up to a second; a connection that died in the
-//! queue costs nobody a pause. Every error is counted; a person hears of the first and of the end.
+//! Invariants:
+//! 1. Without descriptors or memory the loop pauses. Each pause is twice the one before, up to a second.
+//! 2. A connection that died in the queue causes no pause.
+//! 3. Every error is counted. The log has the first failure of a series and its end.
 //!
-//! There is no spare descriptor to close peers with while there are none: a peer in the queue costs nothing and is served as soon as there
-//! is room, one that is closed dials again at once, and the descriptor that was given back for it is whoever's thread is first.
+//! No spare descriptor is kept for closing peers. A peer in the queue costs nothing and is served once there is room. A
+//! closed peer dials again at once, and another thread may take the freed descriptor first.
 
 use crate::config::std;
 use crate::listen::Listen;

@@ -1,12 +1,15 @@
-//! The accept loop in front of the services of a port: who may come in, how long they may take, and how they are asked to leave.
+//! Accepts, authenticates, limits and ends the connections of a port, in front of its services.
 //!
-//! Called by the binary and by stop: [`Edge::new`] around the services, [`Edge::with_tls`], then [`Edge::serve`] over whatever connections
-//! there are. Invariant: no peer holds anything for longer than a limit of [`Config`] says; what one peer does costs no other peer its
-//! connection; `serve` returns within the drain's time of its stop, whatever is open.
+//! Build with [`Edge::new`] around the services and [`Edge::with_tls`]; then [`Edge::serve`] runs over a listener.
+//! Invariants:
+//! 1. No peer holds anything for longer than a limit of [`Config`].
+//! 2. No peer costs another peer its connection.
+//! 3. After its stop, `serve` returns within the drain's time, whatever is open.
 //!
-//! tonic's own server leaves a silent peer connected for ever, spins when there is no descriptor, waits for open streams for ever when it is
-//! stopped, and neither changes its certificate nor cuts a peer off; so connections are accepted, proven and ended here. Who asks is
-//! said by [`Principals`], what each path needs by the .proto files; what is absent is any rule about a single robot, task or area.
+//! tonic's own server does not suffice. It keeps a silent peer connected for ever, spins without a free descriptor, and
+//! waits for open streams for ever when stopped. It neither renews its certificate nor cuts a peer off.
+//! [`Principals`] identifies callers; the .proto files say what each path needs. Absent on purpose: rules about a
+//! single robot, task or area.
 
 mod accept;
 mod activity;

@@ -137,7 +137,7 @@ mod tests {
     use midshift_core::identity::DirectoryToken;
     use midshift_core::limits;
     use midshift_core::time::Utc;
-    use midshift_core::wall::WallClock;
+    use midshift_core::wall_clock::WallClock;
     use std::collections::BTreeMap;
     use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 

@@ -14,7 +14,7 @@ use midshift_core::projection::{self, Outline};
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Item, Key, Row, Seq, Table};
 use midshift_core::time::Now;
-use midshift_store::lead::{self, Settled};
+use midshift_store::leadership::{self, Settled};
 use midshift_store::{Applied, CommitError, Error, GET_KEYS_MAX, Store};
 use std::collections::BTreeSet;
 
@@ -69,7 +69,7 @@ impl Loop {
     /// Answers a command of which these items were committed, or decides it anew.
     fn settle(&mut self, mut asked: Box<Asked>, results: Option<&[Result<Applied, CommitError>]>) {
         asked.lost += 1;
-        let answer = match results.map(lead::settled) {
+        let answer = match results.map(leadership::settled) {
             Some(Settled::Done) => Ok(()),
             Some(Settled::Moved) if asked.lost < limits::COMMAND_TRIES => {
                 metrics::counter!("midshift_fleet_commands_again_total").increment(1);

@@ -1,6 +1,6 @@
 //! Fleet scheduling as a service: reads the feed and the heartbeats, lets `core::fleet` decide, commits, answers questions.
 //!
-//! Called by the binary: [`FleetService::new`], its gRPC face, and [`Reconciler::run`]. Invariant: nothing is decided here; a lost wake
+//! Called by the server: [`FleetService::new`], its gRPC face, and [`Reconciler::run`]. Invariant: nothing is decided here; a lost wake
 //! costs one sweep; no promise is kept in memory.
 
 mod commit;

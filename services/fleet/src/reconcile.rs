@@ -11,14 +11,14 @@ use midshift_core::fleet::projection::{self, FleetProjection};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, explain, found, maps, objects};
 use midshift_core::idempotency;
 use midshift_core::identity::Actor;
-use midshift_core::lead::{FleetLeader, Own, Seat, Stance};
+use midshift_core::leadership::{FleetLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::projection::entries_of;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Key, Log, Seq, Table};
 use midshift_core::time::Now;
 use midshift_core::work::Live;
-use midshift_store::{Dirty, Error, FeedPage, Store, lead};
+use midshift_store::{Dirty, Error, FeedPage, Store, leadership};
 use std::ops::Range;
 use std::sync::OnceLock;
 use std::time::Duration;
@@ -180,7 +180,7 @@ impl Loop {
     /// Reads who leads, and takes over if nobody does.
     async fn take_part(&mut self) -> Result<(), Error> {
         let led = self.seat.leads();
-        let began = lead::take_part(&mut self.seat, self.parts.store.as_ref(), self.parts.clock.as_ref()).await;
+        let began = leadership::take_part(&mut self.seat, self.parts.store.as_ref(), self.parts.clock.as_ref()).await;
         if led && !self.seat.leads() {
             leads_no_more();
         }
@@ -203,7 +203,7 @@ impl Loop {
 
     /// Lets another process lead at once, if this one does.
     async fn hand_over(&mut self) {
-        let Some(is_said) = lead::hand_over(&mut self.seat, self.parts.store.as_ref()).await else { return };
+        let Some(is_said) = leadership::hand_over(&mut self.seat, self.parts.store.as_ref()).await else { return };
         if !is_said {
             tracing::warn!("another process will lead fleet only after a while: this one could not say that it ends");
         }
@@ -217,7 +217,7 @@ impl Loop {
         let Self { seat, parts, .. } = self;
         let alive = projection::alive();
         let reading = parts.store.read(&alive, projection::named);
-        let snapshot = lead::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
+        let snapshot = leadership::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
         let now = self.parts.clock.now();
         let served = self.view.serving(&now);
         let mut next = FleetProjection::new(self.parts.site.clone(), self.started, now);

@@ -5,7 +5,7 @@
 //! 1. Only what has ended goes, no task before its attempts, and nothing that a live task or a robot's mutex names.
 //! 2. A row that stays shields none behind it.
 //!
-//! Called by the binary now and then.
+//! Called by the server now and then.
 
 use midshift_core::Boxed;
 use midshift_core::fleet::projection;

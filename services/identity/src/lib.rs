@@ -1,7 +1,9 @@
-//! Who is who: the certificate authority of a site, enrolment of robots, tokens of people and programs, and the audit.
+//! Identity of a site: its certificate authority, enrolment of robots, tokens of people and programs, and the audit.
 //!
-//! Invariant: no secret leaves this crate but once, in the answer to whoever it was made for; what is stored of it is a digest. One process of a site has the
-//! authority's key and answers for it; each process has this crate's picture of who is known, and a key of its own.
+//! Invariants:
+//! 1. A secret leaves this crate once, in the answer to the caller that it was made for. Only its digest is stored.
+//! 2. One process of a site holds the authority's key and signs with it.
+//! 3. Every process has a projection of the known principals, and a key of its own.
 
 pub mod audit;
 mod authority;

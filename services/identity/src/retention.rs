@@ -6,7 +6,7 @@
 //!    included, and a robot until no certificate of it can be genuine.
 //! 2. The newest token stays, whatever became of it: it says that the site has had its first.
 //!
-//! Called by the binary now and then.
+//! Called by the server now and then.
 
 use midshift_core::Boxed;
 use midshift_core::fleet::rows::RobotControl;

@@ -214,11 +214,13 @@ pub struct Presence {
 }
 
 impl Presence {
-    /// Comes into the folder, made if it is not there, whose owner is settled by that. None: nobody asks whose it is. Others wait until
+    /// Takes the lock of the folder for this process, after making the folder if it is missing, and settles its owner.
+    /// None: the owner is [`Owner::Nobody`], and there is no lock. The first process keeps others waiting until
     /// [`Presence::let_in`].
     ///
     /// # Errors
-    /// If it is another store's, or does not say so and may not be taken, or the one who works in it wants to be alone.
+    /// If the folder is another store's, has no marker and may not be taken, or is in use by a process that it cannot
+    /// be shared with.
     pub async fn come(folder: &Path, owner: &Owner) -> Result<Option<Self>, Error> {
         if *owner == Owner::Nobody {
             return Ok(None);

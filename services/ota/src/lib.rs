@@ -1,6 +1,6 @@
 //! Software of robots on the server: keeps files of signed releases, says which release is the newest, hands out metadata and bytes.
 //!
-//! Called by the binary: [`OtaService::open`], its two gRPC faces, its pages over HTTP/1.1 and [`OtaService::run`]; and [`OtaReader`] where only
+//! Called by the server: [`OtaService::open`], its two gRPC faces, its pages over HTTP/1.1 and [`OtaService::run`]; and [`OtaReader`] where only
 //! bytes are handed out. Several processes may share one folder. Invariant: nothing is signed here that says what software is good; only files
 //! that the newest signed release lists are handed out; none of those is ever taken away.
 

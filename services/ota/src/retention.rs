@@ -5,7 +5,7 @@
 //! 1. A roll-out goes only once it has ended and nothing names it, and after its robots.
 //! 2. A bundle that a person took back stays: published again it is still taken back.
 //!
-//! Called by the binary now and then.
+//! Called by the server now and then.
 
 use midshift_core::Boxed;
 use midshift_core::ids::BundleId;

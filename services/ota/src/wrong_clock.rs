@@ -8,7 +8,7 @@ use crate::repository::{Act, Error, FRESHEN_AFTER_MS, Keyless};
 use crate::{OtaService, Parts};
 use midshift_bundle::trust::{self, Reading, Source, Trusted};
 use midshift_core::time::{Clock, Utc};
-use midshift_core::wall::WallClock;
+use midshift_core::wall_clock::WallClock;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering::Relaxed};
 use tempfile::TempDir;

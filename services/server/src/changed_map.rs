@@ -3,10 +3,10 @@
 //! Called by `serve`, and by `dev` for data that it keeps, before any service begins. Invariant: nothing is written here; fleet tells people, and stores the map that is taken.
 
 use anyhow::Context;
-use midshift_cli::site_file::Loaded;
 use midshift_core::fleet::maps::{MapChange, in_the_way};
 use midshift_core::fleet::projection::{FleetProjection, alive, named};
 use midshift_core::fleet::rows::SiteRow;
+use midshift_core::site::file::Loaded;
 use midshift_core::site::{Site, read_stored};
 use midshift_core::time::Now;
 use midshift_store::{Store, load};

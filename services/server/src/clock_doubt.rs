@@ -4,10 +4,10 @@
 //! each process that shares the folder. In one without a doubt it accepts nothing later.
 
 use anyhow::Context;
-use midshift_cli::clock::ACCEPTED;
 use midshift_core::audit::Note;
 use midshift_core::rows::{Item, Log, Seq, Table, Writer};
 use midshift_core::time::{Clock, Now, Utc};
+use midshift_core::wall_clock::ACCEPTED;
 use midshift_store::{Error, Store};
 use std::fs;
 use std::io::ErrorKind;
@@ -144,7 +144,7 @@ mod tests {
     use midshift_core::audit::AuditRow;
     use midshift_core::ids::SiteId;
     use midshift_core::rows::Fact;
-    use midshift_core::wall::WallClock;
+    use midshift_core::wall_clock::WallClock;
     use midshift_store::{MemoryStore, Query, StoreId};
     use std::sync::Arc;
     use std::sync::atomic::{AtomicI64, Ordering::Relaxed};

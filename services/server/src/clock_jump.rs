@@ -55,7 +55,7 @@ fn write(data: &Path, jump: &Jump) -> anyhow::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use midshift_core::wall::WallClock;
+    use midshift_core::wall_clock::WallClock;
     use std::sync::Arc;
     use std::sync::atomic::{AtomicI64, Ordering::Relaxed};
 

@@ -26,11 +26,9 @@ pub struct Naive {
 }
 
 impl Naive {
-    /// Whether this program has any naive rule in it, be it of a service, of robots or of bundles. Without a test none can be switched on.
-    pub const ARE_BUILT_IN: bool = midshift_core::task::bugs::Bugs::ARE_BUILT_IN
-        || midshift_telemetry::Bugs::ARE_BUILT_IN
-        || midshift_agent::bugs::Bugs::ARE_BUILT_IN
-        || midshift_bundle::bugs::Bugs::ARE_BUILT_IN;
+    /// Whether any naive rule of a service is compiled in. Without a test none can be switched on.
+    pub const ARE_BUILT_IN: bool =
+        midshift_core::task::bugs::Bugs::ARE_BUILT_IN || midshift_telemetry::Bugs::ARE_BUILT_IN;
 }
 
 /// What a server is built from.

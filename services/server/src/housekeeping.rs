@@ -158,9 +158,9 @@ async fn is_abandoned(store: &dyn Store, mark: Seq, wall: Utc) -> Result<bool, E
 }
 
 #[cfg(test)]
-mod aging;
-#[cfg(test)]
 mod tests {
+    mod aging;
+
     use super::*;
     use metrics_exporter_prometheus::PrometheusBuilder;
 

@@ -11,8 +11,8 @@ mod housekeeping;
 pub mod planning;
 pub mod serve;
 mod server;
-pub mod stop;
 pub mod stop_follower;
+pub mod stop_service;
 pub mod storage;
 
 pub use components::{Components, Naive};

@@ -6,7 +6,7 @@ use crate::planning::Planning;
 use crate::server::Server;
 use crate::storage::{Database, Storage};
 use crate::{Components, Naive};
-use crate::{clock_doubt, clock_jump, stop, stop_follower};
+use crate::{clock_doubt, clock_jump, stop_follower, stop_service};
 use anyhow::{Context, bail};
 use midshift_agent::tls;
 use midshift_cli::roles::{Role, Roles};
@@ -181,7 +181,7 @@ async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow
     check_arguments(&args, &roles)?;
     if !args.no_stop && !roles.are_split() {
         // Before rows are brought to this version, from which the one before could not go on.
-        stop::check_program().await?;
+        stop_service::check_program().await?;
     }
     // Before anything is opened: whoever finds the port taken leaves no trace.
     let listener = listen(args.listen).await?;
@@ -287,7 +287,7 @@ fn load_site(args: &Serve) -> anyhow::Result<site_file::Loaded> {
 /// Tells the stop service beside this process whether it may begin with nothing engaged, if this process has its folder.
 async fn announce_first_start(args: &Serve, roles: &Roles, store: &dyn Store) -> anyhow::Result<()> {
     match first_start(args, roles) {
-        Some(occasion) => stop::announce(&args.data.join(FOLDER), store, occasion).await?,
+        Some(occasion) => stop_service::announce(&args.data.join(FOLDER), store, occasion).await?,
         None if args.init_stop => {
             bail!("--init-stop is for a process with role stop-follower, which has the stop service's folder")
         }
@@ -297,11 +297,11 @@ async fn announce_first_start(args: &Serve, roles: &Roles, store: &dyn Store) ->
 }
 
 /// On which occasion this process may announce a first start of the stop service beside it. None: it has not its folder.
-fn first_start(args: &Serve, roles: &Roles) -> Option<stop::Occasion> {
+fn first_start(args: &Serve, roles: &Roles) -> Option<stop_service::Occasion> {
     roles.has(Role::StopFollower).then_some(match (args.init_stop, roles.are_split()) {
-        (true, _) => stop::Occasion::Person,
-        (false, true) => stop::Occasion::Follower,
-        (false, false) => stop::Occasion::Start,
+        (true, _) => stop_service::Occasion::Person,
+        (false, true) => stop_service::Occasion::Follower,
+        (false, false) => stop_service::Occasion::Start,
     })
 }
 
@@ -407,7 +407,7 @@ async fn open_software(
 }
 
 /// A stop service beside this process. Its child is none where one answered already.
-type StopBeside = (stop::Started, Option<Child>);
+type StopBeside = (stop_service::Supervisor, Option<Child>);
 
 /// Tells the stop service beside this process what is engaged and who is known, and starts it unless one answers. None: it runs elsewhere.
 async fn start_stop(
@@ -424,7 +424,7 @@ async fn start_stop(
     if let Some(identity) = identity {
         stop_follower::tell_principals(&folder, identity).context("telling the stop service who is known")?;
     }
-    let program = stop::Started {
+    let program = stop_service::Supervisor {
         site: args.site.clone(),
         data: args.data.clone(),
         listen: args.stop_listen,

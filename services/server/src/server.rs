@@ -425,9 +425,8 @@ async fn publish_health(health: &HealthReporter, names: BTreeSet<&'static str>, 
 }
 
 #[cfg(test)]
-mod frames;
-#[cfg(test)]
 mod tests {
+    mod frames;
     mod old_connections;
 
     use super::*;

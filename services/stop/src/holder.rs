@@ -1,7 +1,9 @@
-//! Which process is the stop service of a folder, and how it is ended when it hangs.
+//! Finds the process that runs the stop service of a folder, and kills it when it hangs.
 //!
-//! Invariant: a process is known by what stands in the file whose lock it holds, and by nothing else; it is ended only if it runs on this machine, in this process's own
-//! numbering, and still holds the lock once there is a handle on it: a number that was given to another process ends nobody.
+//! Invariants:
+//! 1. The process is identified only by the file whose lock it holds.
+//! 2. It is killed only if it runs on this machine, in this process's own PID namespace, and still holds the lock after
+//!    a pidfd was opened. So a reused process number never kills another process.
 
 use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
 use serde::{Deserialize, Serialize};

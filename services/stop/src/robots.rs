@@ -158,7 +158,8 @@ impl Robots {
         })
     }
 
-    /// Lets those go that nobody lists any more and whose silence has stood them. Whether anybody went.
+    /// Removes robots that left the roster, have no line, and stand by their own silence. Returns whether any was
+    /// removed.
     pub fn let_go(&self, now: LinkTime) -> bool {
         if !self.read().values().any(|robot| robot.said().is_gone(now)) {
             return false;

@@ -1,7 +1,8 @@
-//! What others write beside the service's own files: who belongs to the fleet, who is known, and which stops the store has as engaged.
+//! Snapshot files that other processes write into the stop service's folder: the roster of robots, the known
+//! principals, and the stops that the store has as engaged.
 //!
-//! Invariant: written whole under another name and renamed, so that a reader never sees half; one that cannot be read is told once, and the last good
-//! one stays in force.
+//! Invariant: a snapshot is written whole under another name and renamed, so a reader never sees half of it. One that
+//! cannot be read is reported once, and the last good one stays in force.
 
 use crate::changes;
 use crate::inner::Inner;

@@ -1,11 +1,15 @@
-//! The one memory of midshift: rows changed by items under compare-and-set, and a feed of every change in commit order.
+//! The store: rows that items change under compare-and-set, and a feed of every change in commit order.
 //!
-//! Invariant: an item is applied whole or not at all, by the one service that owns its tables
-//! ([`midshift_core::rows::Table::writer`]), and is acknowledged only once it is as durable as the store can make it. No
-//! decision about the fleet is made here. Called by the services through [`Store`]; [`MemoryStore`], [`SqliteStore`] and
-//! [`PostgresStore`] pass one contract suite (`tests/store/contract.rs`).
+//! Services use it through [`Store`]. [`MemoryStore`], [`SqliteStore`] and [`PostgresStore`] pass one contract suite
+//! (`tests/store/contract.rs`).
+//! Invariants:
+//! 1. An item is applied whole or not at all, by the one service that owns its tables
+//!    ([`midshift_core::rows::Table::writer`]).
+//! 2. An item is acknowledged only once it is as durable as the store can make it.
+//! 3. Nothing here decides about the fleet.
 //!
-//! What is volatile (heartbeats, poses) is on the [`LiveBoard`], which several processes share through the [`HeardLog`]; what is bulky (samples) is in the [`FrameLog`]; neither is a row.
+//! Two things are not rows. Heartbeats and poses are volatile and stand on the [`LiveBoard`], which processes share
+//! through the [`HeardLog`]. Samples are bulky and stand in the [`FrameLog`].
 
 mod audit;
 mod board;
@@ -17,7 +21,7 @@ mod frames_queue;
 mod gather;
 mod group;
 mod heard;
-pub mod lead;
+pub mod leadership;
 mod left_out;
 mod migrations;
 mod model;

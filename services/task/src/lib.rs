@@ -1,6 +1,6 @@
 //! Task intake as a service: admits, shows, cancels, resolves and watches tasks. It decides nothing about robots.
 //!
-//! Called by the binary. Invariant: an answer leaves only after its commit; a task is stored whole or not at all; what happens to an
+//! Called by the server. Invariant: an answer leaves only after its commit; a task is stored whole or not at all; what happens to an
 //! admitted task is fleet's.
 
 mod admit;

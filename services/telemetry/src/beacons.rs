@@ -1,7 +1,7 @@
 //! Listens for the beacons of launchers: datagrams of a robot whose agent does not run, because it is being started or tried.
 //!
 //! Invariant: a hint for display, never evidence. Nobody proves anything with a datagram: anybody in the network can send one, so nothing is
-//! decided by it, nothing is written down, and only robots that once said Hello have one. Called by the binary.
+//! decided by it, nothing is written down, and only robots that once said Hello have one. Called by the server.
 
 use crate::projection::LinkProjection;
 use midshift_core::ids::RobotId;

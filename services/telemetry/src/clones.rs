@@ -1,9 +1,12 @@
-//! A machine that attaches with the name of a robot that is attached already, and does not prove that it is the same: it is watched, until it is clear which it is.
+//! Observes a second machine that attaches under the name of an attached robot without proof of succession.
 //!
-//! Either the older session falls silent: then this was its robot, started anew, and comes back to take charge. Or the older one is heard on: then both machines are
-//! alive, and people are told. One with another ring has not the memory of the robot that was heard: it takes charge only when that one's authority has ended, for
-//! until then that robot may still work, in its places, behind a gap in the network.
-//! Invariant: nobody is told of a robot that restarted or moved, and none of the two is told apart by what it could have copied.
+//! 1. If the older session falls silent, the second machine is the robot, started anew. It comes back and takes charge.
+//! 2. If the older session is heard on, two machines are alive, and people are told.
+//! 3. A second machine with another ring lacks the memory of the first. It takes charge only when the authority of the
+//!    first has ended: until then the first may still work, behind a gap in the network.
+//!
+//! Invariant: a robot that restarted or moved is never reported. A copied key or secret never distinguishes the two
+//! machines.
 
 use crate::facts::state;
 use crate::inner::Inner;

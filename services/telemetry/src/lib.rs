@@ -1,6 +1,6 @@
 //! Telemetry ingest as a service: holds the robots' links, keeps their events, serves their live state.
 //!
-//! Called by the binary: [`TelemetryService::new`], its gRPC faces, and [`TelemetryService::run`]. Invariant: an acknowledgement leaves only
+//! Called by the server: [`TelemetryService::new`], its gRPC faces, and [`TelemetryService::run`]. Invariant: an acknowledgement leaves only
 //! after the commit that holds the data; a session and its way down never wait for the store; every stream is drained into bounded queues.
 
 mod beacons;

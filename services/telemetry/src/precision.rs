@@ -1,6 +1,6 @@
 //! How precise a position is kept: as it came for a day, then as a square of the map. Distances and spans are sums that the robot has made before.
 //!
-//! Invariant: made coarser twice, samples are as made coarser once; nothing but positions changes. Called by the binary's upkeep for what is stored, and by
+//! Invariant: made coarser twice, samples are as made coarser once; nothing but positions changes. Called by the server's upkeep for what is stored, and by
 //! `status` for what comes late.
 
 use midshift_core::privacy;

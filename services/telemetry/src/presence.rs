@@ -20,15 +20,6 @@ const PERIOD: Duration = Duration::from_millis(500);
 /// Rows of one item.
 const ROWS_PER_ITEM: usize = 200;
 
-/// Presence by the age of the newest heartbeat.
-pub fn presence_of(heard: Option<LinkTime>, now: LinkTime) -> Presence {
-    match heard.map(|at| now.since(at)) {
-        Some(age) if age <= limits::SUSPECT_AFTER => Presence::Online,
-        Some(age) if age <= limits::OFFLINE_AFTER => Presence::Suspect,
-        _ => Presence::Offline,
-    }
-}
-
 /// What another gateway should have written is left to it for this long.
 const LEFT_TO_OTHERS: LinkDuration = LinkDuration::from_secs(2);
 
@@ -82,7 +73,7 @@ async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: Lin
         .into_iter()
         .filter_map(|robot_id| {
             let live = heard.get(&robot_id).map(AsRef::as_ref);
-            let presence = presence_of(live.map(|live| live.processed_at), now.link);
+            let presence = Presence::since(live.map(|live| live.processed_at), now.link);
             let old = known.get(&robot_id);
             let is_ours = inner.shared.is_none() || inner.registry.is_home(&robot_id);
             let is_news = |row: &PresenceRow| is_ours && live.is_some_and(|live| is_news(row, live));
@@ -138,20 +129,4 @@ fn is_others(inner: &Inner, robot_id: &RobotId, (presence, now): (Presence, Link
         *since = (presence, now);
     }
     now.since(since.1) < LEFT_TO_OTHERS
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn presence_follows_the_age_of_the_newest_heartbeat() {
-        let now = LinkTime(100_000);
-        let at = |age_ms: u64| presence_of(Some(LinkTime(100_000 - age_ms)), now);
-        assert_eq!(
-            [at(3_000), at(3_001), at(31_000), at(31_001)],
-            [Presence::Online, Presence::Suspect, Presence::Suspect, Presence::Offline]
-        );
-        assert_eq!(presence_of(None, now), Presence::Offline);
-    }
 }

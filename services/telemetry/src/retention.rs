@@ -1,7 +1,7 @@
 //! Takes away what is about rings and robots that are gone: marks of rings that a robot has replaced, and rows of robots that were retired long ago.
 //!
 //! Invariant: the marks of the ring that a robot's newest session has stay, however old they are: they guard the inbox and say what of STATUS need
-//! not come again. Called by the binary now and then.
+//! not come again. Called by the server now and then.
 
 use midshift_core::Boxed;
 use midshift_core::limits;

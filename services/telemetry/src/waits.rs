@@ -1,4 +1,4 @@
-//! Waits for what a session may not have: then without an end.
+//! Awaits the optional parts of a session. Each future stays pending for ever where the session lacks the part.
 
 use crate::enrolment::Waits;
 use crate::inner::Inner;

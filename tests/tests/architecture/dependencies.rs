@@ -136,6 +136,7 @@ fn no_package_of_a_program_has_a_profile_of_its_own() {
     // Cargo passes `strip = "debuginfo"` instead of the profile's to a package that an override names.
     let workspace: toml::Table = read("Cargo.toml").parse().expect("a manifest");
     let overrides = workspace["profile"]["release"]["package"].as_table().expect("overrides");
+    assert!(workspace["profile"]["dist"].get("package").is_none(), "what is released is compiled as a release is");
     let has_program = |(folder, manifest): &(String, toml::Table)| {
         manifest.contains_key("bin")
             || [root().join(folder).join("src/main.rs"), root().join(folder).join("src/bin")].iter().any(|p| p.exists())

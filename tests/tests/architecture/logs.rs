@@ -74,7 +74,11 @@ const LOGGED: &[(&str, &str, &str)] = &[
     ("services/ota/src/repository/documents.rs", "problem", "what is wrong with a signed file"),
     ("services/ota/src/rollouts/reconcile.rs", "text", "the key of a row, and what could not be read of it"),
     ("services/ota/src/rollouts/standby.rs", "text", "the key of a row, and what could not be read of it"),
-    ("services/server/src/stop/started.rs", "why", "a sentence of this program, or what the system said of a process"),
+    (
+        "services/server/src/stop_service/supervisor.rs",
+        "why",
+        "a sentence of this program, or what the system said of a process",
+    ),
     ("services/stop/src/changes.rs", "level", "one of four words"),
     ("services/stop/src/opening.rs", "why", "a sentence of this program"),
     ("services/telemetry/src/link.rs", "why", "which field breaks which rule, in the words of the decoder"),

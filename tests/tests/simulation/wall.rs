@@ -5,7 +5,7 @@
 
 use crate::clock::{BEGIN_UNIX_MS, MachineClock, Skew, TrueTime};
 use midshift_core::time::{Clock, Doubt, Jump, Now, Utc};
-use midshift_core::wall::WallClock;
+use midshift_core::wall_clock::WallClock;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering::Relaxed};
 

@@ -9,7 +9,7 @@ use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::{RobotControl, TimerKind};
 use crate::fleet::projection::state::FleetProjection;
-use crate::fleet::tasks::transitions::{News, arm, happen};
+use crate::fleet::tasks::transitions::{News, apply_event, arm};
 use crate::fleet::tasks::{attempts, errand_reports};
 use crate::fleet::traffic::anchor::anchor;
 use crate::ids::{AttemptId, RobotId, Subject};
@@ -92,7 +92,7 @@ fn offer(tx: &mut Tx, task: &TaskState, intake: &TaskIntake, robot_id: &RobotId,
     attempts::take_robot(tx, &record);
     tx.put_row(record.clone(), "attempt.offered");
     arm(tx, TimerKind::OfferAck, &record.attempt, limits::OFFER_VALID.as_ms());
-    happen(tx, &intake.task_id, News::from_event(Event::PlanOffers, None));
+    apply_event(tx, &intake.task_id, News::from_event(Event::PlanOffers, None));
     let known = tx.view.control.get(robot_id.as_str()).map(|c| c.row.clone());
     let mut control = known.unwrap_or_else(|| RobotControl::new(robot_id.clone()));
     control.tasks += 1;

@@ -31,7 +31,7 @@ pub fn robot(view: &FleetProjection, board: &Board, robot_id: &RobotId, now: &No
     match liveness::presence(board, robot_id, now) {
         Presence::Online => {}
         Presence::Suspect => return Err(Code::RobotSuspect.into()),
-        Presence::Offline | Presence::Updating => return Err(Code::RobotOffline.into()),
+        Presence::Offline => return Err(Code::RobotOffline.into()),
     }
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
     engaged_stops::screen(view, robot_id, Some(live))?;

@@ -7,7 +7,7 @@ use crate::fleet::decision::plan::Plan;
 use crate::fleet::projection::index::advance;
 use crate::fleet::projection::queue::{TASKS_PER_TURN, Wait};
 use crate::fleet::projection::state::FleetProjection;
-use crate::fleet::tasks::transitions::{News, happen};
+use crate::fleet::tasks::transitions::{News, apply_event};
 use crate::fleet::tasks::{eligibility, timers};
 use crate::ids::TaskId;
 use crate::limits;
@@ -46,7 +46,7 @@ pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut 
 /// Gives a waiting task to a person.
 fn ask_person(view: &mut FleetProjection, now: Now, task_id: &TaskId, why: Option<&Reason>, plan: &mut Plan) {
     plan.decide(view, now, "fleet", |tx| {
-        happen(tx, task_id, News::from_event(Event::ScheduleToStart, why));
+        apply_event(tx, task_id, News::from_event(Event::ScheduleToStart, why));
     });
 }
 

@@ -1,7 +1,8 @@
-//! How a decision becomes an item: what a turn may still do, what is given up, what is reported, and what people are told.
+//! Turns each decision into one item to commit; limits, reports and gives up decisions; opens incidents.
 //!
-//! In reading order: `slice` bounds a turn, `report` says what it did, `refusals` puts aside what the store never takes, `plan` makes one item
-//! of a decision, `incidents` tells people. Invariant: a decision is one item, or leaves the projection as it was.
+//! In reading order: `slice` limits the work of one turn. `report` counts what was done and says why the rest was not.
+//! `refusals` puts aside decisions that the store refuses for good. `plan` makes the items. `incidents` tells people.
+//! Invariant: a decision is one item, or leaves the projection as it was.
 
 pub mod incidents;
 pub mod plan;

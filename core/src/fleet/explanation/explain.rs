@@ -7,7 +7,7 @@ use crate::fleet::facts::misreads;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::load;
-use crate::fleet::traffic::{closures, routing};
+use crate::fleet::traffic::{closed_places, routing};
 use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -60,7 +60,7 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
     let robots = waits.then(|| screened(view, board, now));
     for (robot_id, against) in robots.into_iter().flatten() {
         let reason = filters::pair(view, board, robot_id, task, intake, now).err().or_else(|| against.clone());
-        let reason = reason.map(|why| closures::name_closed(view, why));
+        let reason = reason.map(|why| closed_places::name_closed(view, why));
         if let Some(reason) = &reason {
             *filtered.entry(reason.code).or_default() += 1;
         }
@@ -180,7 +180,7 @@ pub fn robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotI
         let reason = filters::task(view, board, task, intake, now)
             .and_then(|()| filters::pair(view, board, robot_id, task, intake, now))
             .err()
-            .map(|why| closures::name_closed(view, why));
+            .map(|why| closed_places::name_closed(view, why));
         let goal = intake
             .spec
             .next_goal(crate::work::from_step(&intake.spec.steps, task.next_step) as usize)

@@ -14,7 +14,7 @@ use crate::fleet::projection::queue::Wait;
 use crate::fleet::projection::rows::{Place, RobotHolder};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::{claims, eligibility, plausible};
-use crate::fleet::traffic::{closures, engaged_stops, grants, route_requests, starts};
+use crate::fleet::traffic::{closed_places, engaged_stops, grants, route_requests, starts};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::{Code, Reason};
 use crate::robot::{Mode, Presence, WorkState};
@@ -182,7 +182,7 @@ fn check_goes_on(view: &FleetProjection, board: &Board, now: &Now, robot_id: &Ro
     match liveness::presence(board, robot_id, now) {
         Presence::Online => {}
         Presence::Suspect => return Err(Code::RobotSuspect.into()),
-        Presence::Offline | Presence::Updating => return Err(Code::RobotOffline.into()),
+        Presence::Offline => return Err(Code::RobotOffline.into()),
     }
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
     engaged_stops::screen(view, robot_id, Some(live))?;
@@ -287,7 +287,7 @@ pub fn place_wait(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> 
             let places = wait.places.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
             reason = reason.with(WAITS_FOR, format!("{places}: {} {}", key.replace('_', " "), names.join(", ")));
             if key == SHUT {
-                let closure = names.iter().find_map(|id| closures::find_closure(view, &view.places.get(*id)?.row));
+                let closure = names.iter().find_map(|id| closed_places::find_closed(view, &view.places.get(*id)?.row));
                 reason = closure.into_iter().fold(reason, |reason, closure| closure.word_reason(reason));
             }
         }
@@ -317,7 +317,7 @@ fn in_the_way(
         let known = view.site.find_place(&p.place_id);
         known.is_some_and(|ix| starts::taken(view, ix, p, robot_id) < p.capacity as usize)
     };
-    let misses_a_seat = |p: &Place| !has_seat(p) && closures::find_closure(view, p).is_some();
+    let misses_a_seat = |p: &Place| !has_seat(p) && closed_places::find_closed(view, p).is_some();
     let is_shut = |p: &&Place| p.quarantine.is_some() || view.refused.is_place_aside(&p.place_id) || misses_a_seat(p);
     let holders = |seat: bool| -> BTreeSet<String> {
         names(&mut rows().filter(|p| has_seat(p) == seat).flat_map(|p| &p.holders).map(|h| &h.robot_id))

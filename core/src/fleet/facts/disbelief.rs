@@ -7,7 +7,7 @@ use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::errand_reports;
-use crate::fleet::tasks::transitions::{self, News, happen};
+use crate::fleet::tasks::transitions::{self, News, apply_event};
 use crate::ids::{AttemptId, PlaceId, RobotId, TaskId};
 use crate::reason::{Code, Reason};
 use crate::robot::{FAULT_DISBELIEVED, Fault, FaultClass};
@@ -24,7 +24,7 @@ pub fn disbelieve(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, place
     let report = AttemptReport { step_index, fault, ..report.clone() };
     let why = told(tx.view, robot_id, &report, task_id, place_id);
     incidents::open_as(tx, incident_of(robot_id), why.clone(), Some(robot_id), Some(task_id));
-    happen(tx, task_id, News { event: Event::FailedFinal, why: Some(&why), report: Some(&report) });
+    apply_event(tx, task_id, News { event: Event::FailedFinal, why: Some(&why), report: Some(&report) });
     transitions::release(tx, robot_id, &report);
 }
 
@@ -76,7 +76,7 @@ pub fn doubt(tx: &mut Tx, robot_id: &RobotId, id: &AttemptId, why: &Reason) {
     }
     match id.subject.task_id() {
         Some(task_id) => {
-            happen(tx, task_id, News::from_event(Event::LeaseOver, Some(why)));
+            apply_event(tx, task_id, News::from_event(Event::LeaseOver, Some(why)));
         }
         None => errand_reports::lease_over(tx, robot_id, why.clone()),
     }

@@ -4,7 +4,7 @@
 
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::{HoldToken, RobotControl};
-use crate::fleet::tasks::transitions::{self, News, happen};
+use crate::fleet::tasks::transitions::{self, News, apply_event};
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
 use crate::robot::HardwareStop;
@@ -52,5 +52,5 @@ pub fn holds_changed(tx: &mut Tx, robot_id: &RobotId) {
     let why: Reason = if fleet_stop { Code::HoldByStop } else { Code::HoldByBody }.into();
     let event = if transitions::is_held(tx, &task) { Event::Hold } else { Event::LastHoldGone };
     let why = (event == Event::Hold).then_some(&why);
-    happen(tx, &task_id, News::from_event(event, why));
+    apply_event(tx, &task_id, News::from_event(event, why));
 }

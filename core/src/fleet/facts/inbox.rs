@@ -10,7 +10,7 @@ use crate::fleet::decision::report::Tally;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::HolderState;
 use crate::fleet::projection::state::FleetProjection;
-use crate::fleet::tasks::transitions::{News, event_of, happen, release};
+use crate::fleet::tasks::transitions::{News, apply_event, event_of, release};
 use crate::fleet::tasks::{arrivals, breaker, claims, errand_reports, plausible};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::{Code, Reason};
@@ -96,7 +96,7 @@ pub fn attempt(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, tally: &
         Event::Refused if is_taken => (Event::StopConfirmed, None),
         event => (event, report.refusal.as_ref()),
     };
-    let moved = ours && happen(tx, task_id, News { event, why, report: Some(report) });
+    let moved = ours && apply_event(tx, task_id, News { event, why, report: Some(report) });
     if !moved {
         tally.fenced += 1;
     }
@@ -169,7 +169,7 @@ fn mode_changed(tx: &mut Tx, robot_id: &RobotId, mode: Mode) {
     let why = Reason::from(Code::ManualMode).with("robot_id", robot_id);
     match tx.view.held_by(robot_id).map(|a| a.subject.task_id().cloned()) {
         Some(Some(task_id)) => {
-            happen(tx, &task_id, News::from_event(Event::LeaseOver, Some(&why)));
+            apply_event(tx, &task_id, News::from_event(Event::LeaseOver, Some(&why)));
         }
         Some(None) => errand_reports::lease_over(tx, robot_id, why),
         None => {}

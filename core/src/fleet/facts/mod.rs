@@ -1,8 +1,9 @@
-//! What happened, and what follows of it: events, heartbeats, requests, stops, time, a changed map.
+//! Applies facts to the fleet: events, heartbeats, requests, stops, elapsed time, a changed map.
 //!
-//! In reading order: `feed` takes entries; `inbox` obeys a robot's event, `requests` a person's wish; `repair` compares a heartbeat with the
-//! rows; `holds`, `answers` and `disbelief` are what they share; `stops` keeps stopped robots held; `sweep` gathers what is due by time; `maps`
-//! and `misreads` tell people. Invariant: an entry is obeyed once and in commit order, and repair never overtakes events.
+//! In reading order: `feed` dispatches entries of the feed. `inbox` applies a robot's event, `requests` a person's
+//! request. `repair` compares a heartbeat with the rows. `holds`, `answers` and `disbelief` are shared by these.
+//! `stops` keeps stopped robots held. `sweep` gathers what is due by time. `maps` and `misreads` tell people.
+//! Invariant: an entry is applied once and in commit order, and repair never overtakes events.
 
 pub mod answers;
 pub mod disbelief;

@@ -11,7 +11,7 @@ use crate::fleet::projection::liveness::{Board, is_fresh, is_settled, lease_stan
 use crate::fleet::projection::memory::Attached;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::claims::{PLACES, differences, excess, implausible};
-use crate::fleet::tasks::transitions::{self, News, happen, may_suspend};
+use crate::fleet::tasks::transitions::{self, News, apply_event, may_suspend};
 use crate::fleet::tasks::{arrivals, errand_reports, load, plausible};
 use crate::fleet::traffic::{route_requests, routing};
 use crate::ids::{AttemptId, RobotId};
@@ -106,7 +106,7 @@ fn recharge(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
             .with("robot_id", robot_id)
             .with("battery_permille", vitals.battery_permille)
             .with("mandatory_permille", least);
-        happen(tx, &task_id, News::from_event(Event::Suspend, Some(&why)));
+        apply_event(tx, &task_id, News::from_event(Event::Suspend, Some(&why)));
     }
 }
 
@@ -140,7 +140,7 @@ fn lease_over(tx: &mut Tx, robot_id: &RobotId, tally: &mut Tally) {
     let why = Reason::from(Code::LeaseOver).with("robot_id", robot_id);
     match id.subject.task_id() {
         Some(task_id) => {
-            happen(tx, task_id, News::from_event(Event::LeaseOver, Some(&why)));
+            apply_event(tx, task_id, News::from_event(Event::LeaseOver, Some(&why)));
         }
         None => errand_reports::lease_over(tx, robot_id, why),
     }
@@ -179,21 +179,21 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
             let Some(task_id) = id.subject.task_id() else { return };
             tally.repaired += 1;
             let report = report(l.state);
-            happen(tx, task_id, News { event: Event::StepUnknown, why: None, report: Some(&report) });
+            apply_event(tx, task_id, News { event: Event::StepUnknown, why: None, report: Some(&report) });
         }
         Some(l) if needs_sight(&a, live) => {
             answers::answered(tx, robot_id);
             let Some(task_id) = id.subject.task_id() else { return errand_reports::seen(tx, robot_id) };
             tally.repaired += 1;
             let report = report(l.state);
-            happen(tx, task_id, News { event: Event::SeenRunning, why: None, report: Some(&report) });
+            apply_event(tx, task_id, News { event: Event::SeenRunning, why: None, report: Some(&report) });
         }
         // The event that told of it was lost for good: what a robot says only adds.
         Some(l) if l.step_index > a.step_index || (l.opened && !a.opened) => {
             let Some(task_id) = id.subject.task_id() else { return };
             tally.repaired += 1;
             let report = report(l.state);
-            happen(tx, task_id, News { event: Event::Progress, why: None, report: Some(&report) });
+            apply_event(tx, task_id, News { event: Event::Progress, why: None, report: Some(&report) });
         }
         Some(_) => {}
     }
@@ -283,7 +283,7 @@ fn stalled(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     let quiet = tx.now.site.since(live.progress_at.max(tx.view.started.site).max(excused_at)).as_ms();
     if quiet > stall_ms && !young {
         let why = Reason::from(Code::Stalled).with("quiet_ms", quiet);
-        happen(tx, &task_id, News::from_event(Event::Stall, Some(&why)));
+        apply_event(tx, &task_id, News::from_event(Event::Stall, Some(&why)));
     }
 }
 

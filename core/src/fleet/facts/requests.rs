@@ -5,7 +5,7 @@ use super::stops;
 use crate::fleet::decision::plan::{Plan, Tx, mark};
 use crate::fleet::projection::rows::HoldToken;
 use crate::fleet::projection::state::FleetProjection;
-use crate::fleet::tasks::transitions::{News, happen};
+use crate::fleet::tasks::transitions::{News, apply_event};
 use crate::fleet::traffic::grants;
 use crate::ids::{AreaId, RobotId, TaskId};
 use crate::limits;
@@ -59,7 +59,7 @@ fn cancel(tx: &mut Tx, task_id: &TaskId, force: bool, request: &TaskRequest) {
     let code = if force { Code::Forced } else { Code::CanceledByUser };
     let why = Reason::new(code, request.reason.clone()).with("actor", &request.actor);
     let event = if force { Event::CancelForce } else { Event::Cancel };
-    happen(tx, task_id, News::from_event(event, Some(&why)));
+    apply_event(tx, task_id, News::from_event(event, Some(&why)));
 }
 
 /// What a person may answer to a task in NEEDS_OPERATOR.
@@ -100,7 +100,7 @@ fn resolve(tx: &mut Tx, task_id: &TaskId, resolution: Resolution, request: &Task
         Resolution::Canceled => Event::ResolveCanceled,
     };
     let why = Reason::new(Code::ResolvedByUser, request.reason.clone()).with("actor", &request.actor);
-    happen(tx, task_id, News::from_event(event, Some(&why)));
+    apply_event(tx, task_id, News::from_event(event, Some(&why)));
 }
 
 /// One thing that is let go.
@@ -153,7 +153,7 @@ fn resume(tx: &mut Tx, resume: &Resume) {
             let free = task.holds.is_empty();
             tx.put_row(task, "task.resumed");
             if free {
-                happen(tx, task_id, News::from_event(Event::LastHoldGone, None));
+                apply_event(tx, task_id, News::from_event(Event::LastHoldGone, None));
             }
         }
     }

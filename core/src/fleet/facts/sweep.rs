@@ -8,7 +8,7 @@ use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::memory::Agenda;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::timers;
-use crate::fleet::tasks::transitions::{News, happen};
+use crate::fleet::tasks::transitions::{News, apply_event};
 use crate::fleet::traffic::desired;
 use crate::ids::RobotId;
 use crate::rows::Record;
@@ -56,7 +56,7 @@ pub(in crate::fleet) fn carry_out(
     }
     while let Some(task_id) = view.agenda.suspended.pop_if(|_| !plan.is_cut()) {
         plan.decide(view, now, "fleet", |tx| {
-            happen(tx, &task_id, News::from_event(Event::RetryDue, None));
+            apply_event(tx, &task_id, News::from_event(Event::RetryDue, None));
         });
     }
     compared

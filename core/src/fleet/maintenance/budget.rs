@@ -1,11 +1,18 @@
-//! How many robots of an area may be out of work at once, and who is next.
+//! Limits how many robots of an area are out of work at once, and orders the robots that wait.
 //!
-//! Called once a cycle, before drains go on. Invariant: a drain that may wait begins only in an item that also writes its area's row, so two planners
-//! cannot both spend the last place; a robot that is out for several reasons counts once, and one that was written off does not until it is
-//! heard. Robots that charge or have no work are asked first. Drains of people and urgent ones count and do not wait. Whoever changes to
-//! something new waits for the area's window too. The item in which a drain begins relies on the request and on the area's rules: whoever takes
-//! the one back or freezes the other is not passed unseen. Whoever goes back from what was aborted waits for drains alone, and for those only that end by themselves: a robot that only a person brings
-//! back to work would otherwise keep it on bad software for as long. What an area's rules keep in work by capability holds for it too.
+//! Called once a cycle, before drains go on. Invariants:
+//! 1. A waiting drain begins only in an item that also writes its area's row, so two planners cannot both spend the
+//!    last place. That item relies on the drain's request, its release and the area's rules: if one of them changes
+//!    meanwhile, it conflicts.
+//! 2. A robot that is out of work for several reasons counts once. A robot that was written off counts again once it is
+//!    heard.
+//! 3. Urgent drains begin first, then drains of robots that charge, of robots without work, and of the others; older
+//!    ones first among these.
+//! 4. Drains of people and urgent drains count, and do not wait.
+//! 5. A drain for new software also waits for the area's update window.
+//! 6. A drain away from aborted software waits only for drains that end without a person: one stuck robot would
+//!    otherwise keep it on bad software.
+//! 7. What the area's rules keep in work by capability limits the drains of 6 too.
 
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::{self, Board};

@@ -53,7 +53,7 @@ pub fn ask(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str, within_ms
 }
 
 /// Ends every drain of the robot that a person asked for, and gives the robot back to work.
-pub fn release(tx: &mut Tx, robot_id: &RobotId) {
+pub fn undrain(tx: &mut Tx, robot_id: &RobotId) {
     let asked: Vec<DrainId> =
         tx.view.all_drains_of(robot_id).filter(|d| d.is_of_person()).map(|d| d.drain_id.clone()).collect();
     asked.iter().for_each(|drain_id| give_back(tx, robot_id, drain_id));
@@ -70,7 +70,7 @@ fn give_back(tx: &mut Tx, robot_id: &RobotId, drain_id: &DrainId) {
 
 /// Takes what the rollout service asks for and what it lets go. Both rows are relied upon: it takes a request away only while there is
 /// no drain, and a drain is made only while the request stands alone.
-pub fn obey(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
+pub fn apply_requests(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     let released: Vec<(RobotId, DrainId)> = (view.drain_releases.keys())
         .filter_map(|id| view.drains.get(id))
         .map(|d| (d.row.robot_id.clone(), d.row.drain_id.clone()))
@@ -156,7 +156,7 @@ fn further(tx: &mut Tx, drain: &Drain, board: &Board) {
                 });
                 if suspends {
                     let why = Reason::from(Code::DrainSuspend).with("drain_id", &drain.drain_id);
-                    transitions::happen(tx, task_id, News::from_event(Event::Suspend, Some(&why)));
+                    transitions::apply_event(tx, task_id, News::from_event(Event::Suspend, Some(&why)));
                 }
             }
             // A charge ends as it is: the robot keeps its place and goes on charging. A way to a charger or to a park goes on.

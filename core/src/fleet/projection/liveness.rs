@@ -11,11 +11,7 @@ use std::sync::Arc;
 
 /// Whether a robot is heard, from the board alone. After a start of fleet every lease counts as renewed at that moment.
 pub fn presence(board: &Board, robot_id: &RobotId, now: &Now) -> Presence {
-    match board.get(robot_id) {
-        Some(live) if now.link.since(live.processed_at) <= limits::SUSPECT_AFTER => Presence::Online,
-        Some(live) if now.link.since(live.processed_at) <= limits::OFFLINE_AFTER => Presence::Suspect,
-        _ => Presence::Offline,
-    }
+    Presence::since(board.get(robot_id).map(|live| live.processed_at), now.link)
 }
 
 /// Whether the robot may still have authority to go on.

@@ -1,8 +1,9 @@
-//! What fleet knows: rows by table, what is derived from them, and what only this process knows.
+//! Fleet's projection: its rows by table, indices derived from them, and memory of this process alone.
 //!
-//! In reading order: `rows` and `command` are what fleet alone writes; `queue`, `memory` and `refused` are parts of the projection; `state` is
-//! the projection; `index` keeps what is derived, `loading` reads rows into it; `liveness` and `objects` answer from it whether a robot is
-//! heard, and who may see what. Invariant: nothing here decides: this room makes no item and uses no other room.
+//! In reading order: `rows` and `command` define the rows that only fleet writes. `queue`, `memory` and `refused` are
+//! parts of the projection, and `state` is the whole. `index` updates the indices; `loading` reads rows in. `liveness`
+//! answers whether a robot is heard, `objects` whether a caller may act on something.
+//! Invariant: nothing here decides: this module makes no item and uses no sibling module.
 
 pub mod command;
 pub mod index;

@@ -84,11 +84,12 @@ pub(in crate::fleet) fn explain_load(view: &FleetProjection, robot_id: &RobotId,
     reason.with(WAITS_FOR, format!("a person who has looked: midshift robot load {robot_id} --none"))
 }
 
-/// Whether a person's word can settle what the robot carries: not against its own word while it is heard, unless it knows that by
-/// memory alone, nor beside a task whose item lies on it as far as anybody knows.
+/// Whether a person may declare that the robot carries nothing. Refused in two cases:
+/// 1. The robot is heard, reports a load, and does not know it by memory alone.
+/// 2. A task is opened on this robot, so that its item still lies on it as far as the rows know.
 ///
 /// # Errors
-/// Who says otherwise.
+/// The case that applies, with what to do instead.
 pub(in crate::fleet) fn may_settle(
     view: &FleetProjection,
     board: &Board,

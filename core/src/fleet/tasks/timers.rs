@@ -4,7 +4,7 @@
 //! never frees it.
 
 use super::errand_reports;
-use super::transitions::{News, arm, disarm, happen};
+use super::transitions::{News, apply_event, arm, disarm};
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{Timer, TimerKind};
@@ -66,7 +66,7 @@ pub fn fire(tx: &mut Tx, timer: &Timer, board: &Board) {
     disarm(tx, timer.kind, &timer.attempt);
     if current {
         let why = Reason::from(code);
-        happen(tx, &task_id, News::from_event(event, Some(&why)));
+        apply_event(tx, &task_id, News::from_event(event, Some(&why)));
     }
 }
 
@@ -88,7 +88,7 @@ fn winds_down(tx: &Tx, task_id: &TaskId, attempt: &AttemptId, board: &Board) -> 
 /// The deadline of a task passed.
 pub fn deadline(tx: &mut Tx, task_id: &TaskId) {
     let why: Reason = Code::DeadlinePassed.into();
-    happen(tx, task_id, News::from_event(Event::Deadline, Some(&why)));
+    apply_event(tx, task_id, News::from_event(Event::Deadline, Some(&why)));
 }
 
 /// The schedule_to_start of a task counts while it is ready, from when it began to wait, and stands still while it is not.

@@ -35,7 +35,7 @@ impl<'a> News<'a> {
 }
 
 /// Moves `task_id` by the table. False: the event means nothing there and is only counted.
-pub fn happen(tx: &mut Tx, task_id: &TaskId, news: News) -> bool {
+pub fn apply_event(tx: &mut Tx, task_id: &TaskId, news: News) -> bool {
     let Some(task) = tx.view.task(task_id).cloned() else { return false };
     let Some(intake) = tx.view.intake(task_id).cloned() else { return false };
     let attempt = task.attempt_id().and_then(|id| tx.view.attempt(&id).cloned());

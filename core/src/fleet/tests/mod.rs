@@ -2,7 +2,7 @@
 
 mod arrivals;
 mod backlog;
-mod closures;
+mod closed_places;
 mod drains;
 mod energy;
 mod incidents;

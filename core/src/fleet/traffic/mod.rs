@@ -1,17 +1,18 @@
-//! Where robots may drive: which places they are granted, by which route, and what each robot is told.
+//! Grants places to robots, routes them, and composes what each robot should do.
 //!
-//! In reading order: `engaged_stops` and `starts` say what keeps a place; `routing` finds a way; `anchor` binds a permission to a heartbeat;
-//! `desired` composes what a robot should have; `route_requests` says who needs more of its route; `grants` says whether places are free and gives them;
-//! `bays` clears a place that others need; `serve` does all of it in turn; `closures` tells people what is closed. Invariant: a place is given on only
-//! by a robot's own report or by a person, never by time.
+//! In reading order: `engaged_stops` and `starts` find places that a fleet stop or an expected robot keeps. `routing`
+//! finds a route. `anchor` ties a permission to a heartbeat. `desired` composes desired work. `route_requests` orders
+//! the robots that need more of their route. `grants` checks that places are free and grants them. `bays` clears a
+//! place that others need. `allocation` runs all of it in turn. `closed_places` tells people what is closed.
+//! Invariant: a place passes to another robot only by a robot's own report or by a person, never by time.
 
+pub mod allocation;
 pub mod anchor;
 mod bays;
-pub mod closures;
+pub mod closed_places;
 pub mod desired;
 pub mod engaged_stops;
 pub mod grants;
 pub mod route_requests;
 pub mod routing;
-pub mod serve;
 pub mod starts;

@@ -236,7 +236,7 @@ fn carry_out_verb(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor
         Verb::Abort => advance::abort(tx, rollout, why(Code::AbortedByUser), false, None, Some(actor.to_string())),
         Verb::Exclude(robot_id) => {
             let row = RolloutRobot::id_of(id, robot_id);
-            moves::make(tx, &NoSign, board, &row, Move::Skip(why(Code::SkippedExcluded)));
+            moves::apply(tx, &NoSign, board, &row, Move::Skip(why(Code::SkippedExcluded)));
         }
         Verb::Lost(robot_id) => {
             let Some(row) = tx.view.robot_of(id, robot_id).cloned() else { return };

@@ -1,9 +1,9 @@
-//! What the rollout service knows: what people ask for, rows by table, and what is derived from them.
+//! The rollout service's projection: requests of people, rows by table, and indices derived from them.
 //!
-//! In reading order: `spec` and `requests` are what is asked for, `timestamp` and `rows` are what is written down;
-//! `queue` says whose turn it is; `state` is the projection, `index` keeps what is derived from its rows, `ended` what
-//! it holds of roll-outs that have ended, `retention` which bundles are still needed. Invariant: nothing here decides:
-//! this room makes no item and uses no other room.
+//! In reading order: `spec` and `requests` define what people ask. `timestamp` and `rows` define what is stored.
+//! `queue` finds the robots whose turn it is. `state` is the projection, and `index` updates its indices. `ended` keeps
+//! the roll-outs that have ended and are still needed. `retention` finds the bundles that are still needed.
+//! Invariant: nothing here decides: this module makes no item and uses no sibling module.
 
 pub mod ended;
 mod index;

@@ -499,8 +499,9 @@ pub fn is_irreversible(view: &RolloutProjection, rollout: &Rollout) -> bool {
     view.bundles.get(rollout.spec.bundle.as_str()).is_some_and(|b| b.row.is_irreversible)
 }
 
-/// Nobody can sign what its robots take, whatever its phase: newcomers of one that is completed wait too. Who goes back
-/// was told already with what it goes back from.
+/// Whether no directive for its robots can be signed now, whatever its phase: newcomers of a completed roll-out wait
+/// too.
+/// False for a roll-out that takes another one back: its robots learnt of the way back with that other one.
 pub fn is_keyless(view: &RolloutProjection, rollout: &Rollout) -> bool {
     view.keyless.is_some() && rollout.revert_of.is_none()
 }

@@ -32,7 +32,7 @@ use crate::time::Now;
 use crate::update::{ActivationGrant, DesiredUpdate, Goal};
 
 /// Writes what is due for a robot, by the id of its row.
-pub fn make(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
+pub fn apply(tx: &mut Tx, sign: &dyn Sign, board: &Board, id: &str, due: Move) {
     let Some(mut r) = tx.view.robots.get(id).map(|r| r.row.clone()) else { return };
     let Some(rollout) = tx.view.rollout(&r.rollout_id).cloned() else { return };
     let Some(to) = machine::next(r.step, &due) else { return };

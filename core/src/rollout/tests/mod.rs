@@ -442,7 +442,7 @@ impl Rig {
             let row = crate::projection::row_of(entry, table);
             self.fleet.absorb(&key, entry.revision, row.as_ref()).expect("a row");
         }
-        drain::obey(&mut self.fleet, self.now, &mut plan);
+        drain::apply_requests(&mut self.fleet, self.now, &mut plan);
         budget::plan(&mut self.fleet, &self.board, self.now, &mut plan);
         drain::plan(&mut self.fleet, &self.board, self.now, &mut plan);
         plan.items

@@ -7,7 +7,7 @@ use midshift_core::identity::{Actor, Digest, Directory, DirectoryToken, Secret, 
 use midshift_core::ids::SiteId;
 use midshift_core::reason::Code;
 use midshift_core::time::{Clock, LinkDuration, Utc};
-use midshift_core::wall::WallClock;
+use midshift_core::wall_clock::WallClock;
 use midshift_edge::tls::Clients;
 use midshift_edge::{Config, Denial, Denials, SitePrincipals, robot_of};
 use sha2::Digest as _;

@@ -4,7 +4,7 @@ use crate::harness::{Shaky, World};
 use crate::old_site::OldSite;
 use midshift_core::fleet::bugs::Bugs;
 use midshift_core::ids::TaskId;
-use midshift_core::lead::FleetLeader;
+use midshift_core::leadership::FleetLeader;
 use midshift_core::reason::Code;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;

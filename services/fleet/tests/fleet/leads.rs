@@ -2,7 +2,7 @@
 
 use crate::harness::{Shaky, World};
 use midshift_core::fleet::rows::SiteRow;
-use midshift_core::lead::FleetLeader;
+use midshift_core::leadership::FleetLeader;
 use midshift_core::reason::Code;
 use midshift_core::rows::Table;
 use midshift_core::site::{CORRIDOR, DEMO};

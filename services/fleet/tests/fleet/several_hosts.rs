@@ -4,7 +4,7 @@ use crate::harness::World;
 use crate::server::PostgresServer;
 use midshift_core::fleet::bugs::Bugs;
 use midshift_core::ids::SiteId;
-use midshift_core::lead::FleetLeader;
+use midshift_core::leadership::FleetLeader;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
 use midshift_core::time::Clock;

@@ -1,6 +1,6 @@
 //! What the chains need that nobody decides: an hourly row that quotes the heads of the others, and the end of what is old.
 //!
-//! Invariant: whatever is quoted was committed before the quote. Called by the binary, for the services that its process has.
+//! Invariant: whatever is quoted was committed before the quote. Called by the server, for the services that its process has.
 
 use midshift_core::Boxed;
 use midshift_core::audit::{Head, Kind, Note, open};

@@ -6,7 +6,7 @@ use midshift_core::ids::SiteId;
 use midshift_core::reason::{Code, Refusal};
 use midshift_core::rows::Table;
 use midshift_core::time::{Clock, Utc};
-use midshift_core::wall::WallClock;
+use midshift_core::wall_clock::WallClock;
 use midshift_identity::{Duty, Error, IdentityService, Parts};
 use midshift_proto::access::local;
 use midshift_proto::denying::Told;

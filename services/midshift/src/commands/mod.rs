@@ -26,11 +26,12 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 /// What it says of itself. A program that was built for tests has their naive rules in it and says so: none is ever released.
-const VERSION: &str = if Naive::ARE_BUILT_IN {
-    concat!(env!("CARGO_PKG_VERSION"), " with seeded bugs, for tests only")
-} else {
-    env!("CARGO_PKG_VERSION")
-};
+const VERSION: &str =
+    if Naive::ARE_BUILT_IN || midshift_agent::bugs::Bugs::ARE_BUILT_IN || midshift_bundle::bugs::Bugs::ARE_BUILT_IN {
+        concat!(env!("CARGO_PKG_VERSION"), " with seeded bugs, for tests only")
+    } else {
+        env!("CARGO_PKG_VERSION")
+    };
 
 /// A control plane for fleets of working robots. Not a safety function.
 #[derive(Parser)]
@@ -125,7 +126,8 @@ pub fn main() -> ExitCode {
     {
         // The same process: whoever has started it goes on with its id, its input and its signals.
         let log = args.log.argument().into_iter();
-        let error = midshift_server::stop::replace_this(&log.chain(arguments.iter().cloned()).collect::<Vec<_>>());
+        let error =
+            midshift_server::stop_service::replace_this(&log.chain(arguments.iter().cloned()).collect::<Vec<_>>());
         return Exit::from(error).report(&Out::for_output(args.output));
     }
     let serves = matches!(&args.command, Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run { .. }));

@@ -1,4 +1,4 @@
-//! What is asked of a place where files of releases are kept, and what it says of them.
+//! The storage interface for files of releases: the trait [`Content`] and its values.
 
 use crate::disk::Error;
 use async_trait::async_trait;

@@ -1,8 +1,11 @@
-//! Documents as they are shown: what the timestamp of a folder leads to, and what another process that shares the folder made of it since.
+//! Shows the newest signed documents: those that the folder's timestamp leads to, also when another process published.
 //!
-//! Invariant: nothing is written here. What is shown never goes back: a folder that says something older, or something else under the same
-//! number, is damaged, and what was shown before stays. A file that the disk does not give at the moment is not gone: what was known of it
-//! stays, and it is tried again each time the folder is followed, once a second; never by whoever only asks for something.
+//! Invariants:
+//! 1. Nothing is written here.
+//! 2. What is shown never goes back. A folder with an older document, or with another one under the same number, is
+//!    damaged, and the documents shown before stay.
+//! 3. A file that the disk fails to give is not gone. What was known of it stays, and it is tried again once a second,
+//!    whenever the folder is followed; a request never tries it.
 
 use super::check;
 use super::error::Error;

@@ -1,7 +1,7 @@
 //! Roll-outs as a service: reads the feed and the heartbeats, lets `core::rollout` decide, signs, commits, answers
 //! questions.
 //!
-//! Called by the binary: [`RolloutService::new`], its gRPC face, and [`Planner::run`]. Invariant: nothing is decided
+//! Called by the server: [`RolloutService::new`], its gRPC face, and [`Planner::run`]. Invariant: nothing is decided
 //! here; a lost wake costs one sweep; what is signed was decided by the planner and is committed with the row that
 //! explains it.
 

@@ -12,7 +12,7 @@ use crate::collect::Named;
 use crate::service::OtaService;
 use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
-use midshift_core::lead::{OtaLeader, Own, Seat, Stance};
+use midshift_core::leadership::{OtaLeader, Own, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::projection;
 use midshift_core::reason::{Code, Kind, Refusal};
@@ -25,7 +25,7 @@ use midshift_core::rows::{Entry, Item, Log, Seq, Table};
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, Now};
 use midshift_core::work::Live;
-use midshift_store::lead::{self, Settled};
+use midshift_store::leadership::{self, Settled};
 use midshift_store::{Applied, CommitError, Dirty, Error, LiveBoard, Store, follow};
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -184,7 +184,7 @@ impl Loop {
     /// Reads who leads, and takes over if nobody does.
     async fn take_part(&mut self) -> Result<(), Error> {
         let led = self.seat.leads();
-        let began = lead::take_part(&mut self.seat, self.parts.store.as_ref(), self.parts.clock.as_ref()).await;
+        let began = leadership::take_part(&mut self.seat, self.parts.store.as_ref(), self.parts.clock.as_ref()).await;
         if led && !self.seat.leads() {
             self.lead_no_more();
         }
@@ -218,7 +218,7 @@ impl Loop {
 
     /// Lets another process lead at once, if this one does.
     async fn hand_over(&mut self) {
-        let Some(is_said) = lead::hand_over(&mut self.seat, self.parts.store.as_ref()).await else { return };
+        let Some(is_said) = leadership::hand_over(&mut self.seat, self.parts.store.as_ref()).await else { return };
         if !is_said {
             tracing::warn!(
                 "another process will lead roll-outs only after a while: this one could not say that it ends"
@@ -234,7 +234,7 @@ impl Loop {
         let Self { seat, parts, .. } = self;
         let parts_read = ended::alive();
         let reading = parts.store.read(&parts_read, ended::named);
-        let snapshot = lead::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
+        let snapshot = leadership::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
         let now = self.parts.clock.now();
         let served = self.view.served_ms(&now);
         let mut next = RolloutProjection::new(self.parts.site.clone(), self.started, now);
@@ -414,7 +414,7 @@ impl Loop {
     /// Answers a command of which these items were committed, or decides it anew.
     fn settle(&mut self, mut asked: Box<Asked>, taken: Taken, results: Option<&[Result<Applied, CommitError>]>) {
         asked.lost += 1;
-        let answer = match results.map(lead::settled) {
+        let answer = match results.map(leadership::settled) {
             Some(Settled::Done) => Ok(taken),
             Some(Settled::Moved) if asked.lost < limits::COMMAND_TRIES => {
                 self.again.push(Request::Do(asked));

@@ -7,7 +7,7 @@ use midshift_core::site::{DEMO, text};
 use midshift_core::stop::Reset;
 use midshift_core::stop::ladder::Around;
 use midshift_core::time::{Jump, Utc};
-use midshift_core::wall::WallClock;
+use midshift_core::wall_clock::WallClock;
 use midshift_proto::convert::stop::CheckIn;
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::Confirmation as C;

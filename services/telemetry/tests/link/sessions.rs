@@ -8,7 +8,7 @@ use midshift_core::reason::Code;
 use midshift_core::robot::{HeldPlace, Lane, Mode, ReportedState};
 use midshift_core::rows::{Expect, Item, Log, Seq, Writer};
 use midshift_core::time::{Clock, Utc};
-use midshift_core::wall::WallClock;
+use midshift_core::wall_clock::WallClock;
 use midshift_core::work::{DesiredWork, InboxItem, RobotEvent, Sample, SampleBody, Session};
 use midshift_proto::session::{ClockSample, CloseCode, Downlink, Heartbeat, LaneAck, LaneBatch, Uplink};
 use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, StoreId, load};

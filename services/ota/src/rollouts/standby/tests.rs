@@ -15,7 +15,7 @@ use crate::{OtaService, Parts as OtaParts};
 use midshift_bundle::digest::Digest;
 use midshift_core::fleet::rows::FleetMark;
 use midshift_core::ids::RolloutId;
-use midshift_core::lead::OtaLeader;
+use midshift_core::leadership::OtaLeader;
 use midshift_core::rollout::bugs::Bugs;
 use midshift_core::rollout::rows::{Bundle, OtaMark, Phase, Rollout};
 use midshift_core::rows::{Item, Log, Record, Revision, Table, Writer};

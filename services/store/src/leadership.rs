@@ -1,9 +1,9 @@
-//! Taking part in who leads a service: the law is [`midshift_core::lead`], and this reads and writes its row.
+//! Taking part in who leads a service: the law is [`midshift_core::leadership`], and this reads and writes its row.
 //!
 //! Invariant: what was read counts from after the reading, since an answer may take long; what was claimed counts from before the claim.
 
 use crate::{Applied, CommitError, Error, Store};
-use midshift_core::lead::{LeaderRow, Seat, Stance};
+use midshift_core::leadership::{LeaderRow, Seat, Stance};
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use std::pin::pin;

@@ -1,7 +1,7 @@
 //! Whoever announces a message that is too large is refused before a byte of it is taken: at each service of both ports, and by nobody known much earlier.
 
-use super::tests::parts;
-use super::*;
+use super::super::*;
+use super::parts;
 use crate::planning::Planning;
 use axum::body::HttpBody;
 use http::Request;

@@ -2,7 +2,7 @@
 
 use super::Rig;
 use crate::fleet::rows::{HolderState, Incident, Place, PlaceHolder};
-use crate::fleet::traffic::closures;
+use crate::fleet::traffic::closed_places;
 use crate::fleet::{Pace, Plan, incidents};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::Code;
@@ -33,7 +33,7 @@ fn wait_a() -> PlaceId {
 fn open_after(rig: &mut Rig, secs: u64) -> Vec<Incident> {
     for _ in 0..secs {
         rig.pass(1_000);
-        closures::tell_closed(&mut rig.view, rig.now, &mut Plan::default());
+        closed_places::keep_incidents(&mut rig.view, rig.now, &mut Plan::default());
     }
     let open = rig.view.incidents.values().map(|i| &i.row).filter(|i| i.closed.is_none());
     open.filter(|i| i.reason.code == Code::PlaceQuarantined).cloned().collect()

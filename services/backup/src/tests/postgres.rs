@@ -1,10 +1,10 @@
 //! A backup of a server on PostgreSQL has its rows and its releases, and becomes one store again or nothing.
 
-use super::part::POSTGRES;
-use super::place::Place;
-use super::tests::{NOW, let_in, list_of_both, release, site, somebody_known};
-use super::{Access, Identity, Places, back_up, name_all, restore, verify};
+use super::{NOW, let_in, list_of_both, release, site, somebody_known};
+use crate::part::POSTGRES;
 use crate::postgres_server::PostgresServer;
+use crate::staging::Staging;
+use crate::{Access, Identity, Places, back_up, name_all, restore, verify};
 use midshift_core::rows::{Expect, Index, Item, Key, RowChange, Table, Write, Writer};
 use midshift_ota::content::Room;
 use midshift_ota::folder::{Owner, mark};
@@ -202,7 +202,7 @@ async fn when_nobody_knows_whether_the_rows_came_folders_stay_and_people_are_tol
     let config = PostgresConfig::new(server.database_named("silent"));
     let rows = PostgresRestore::begin(&config, used.dir.path(), &copy, &StoreId::fresh()).await.expect("rows");
     server.emptied("silent");
-    let place = Place::new(&used.at("restored")).expect("a folder");
+    let place = Staging::new(&used.at("restored")).expect("a folder");
     let error = name_all([(place, used.at("restored"))].into_iter(), Some(rows)).await.expect_err("it is gone");
     let told = format!("{error:#}");
     assert!(told.contains("has not said whether it took the rows") && told.contains("restore again"), "{told}");

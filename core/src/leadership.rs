@@ -1,8 +1,10 @@
-//! Who of several processes of one service plans: one row that one of them holds and renews, and the others watch.
+//! Elects the one process of a service that plans: it renews a lease row, and the other processes watch that row.
 //!
-//! Called by the reconcilers of fleet and of roll-outs. Invariant: no two clocks are compared. A leader counts from before it renewed, whoever
-//! watches counts from when it saw that, and the first count is the shorter one, so a leader stops by itself before anybody takes over. Two that
-//! lead all the same write nothing twice: every item expects revisions. The lease saves them from planning in vain.
+//! Called by the reconcilers of fleet and of roll-outs. Invariants:
+//! 1. The clocks of two machines are never compared. The leader counts from before its renewal; a standby counts from
+//!    when it saw that renewal. The leader's count is the shorter one, so it stops before a standby takes over.
+//! 2. Two processes that lead at once still write nothing twice, since every item expects revisions. The lease only
+//!    saves them from planning in vain.
 
 use crate::limits;
 use crate::rows::{BadRow, Entry, Expect, Item, Key, Record, Revision, Row, Table, body_is_json};

@@ -10,9 +10,9 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 /// A folder under a name of its own until it is whole.
-pub(super) struct Place(tempfile::TempDir);
+pub(super) struct Staging(tempfile::TempDir);
 
-impl Place {
+impl Staging {
     pub(super) fn new(to: &Path) -> anyhow::Result<Self> {
         ensure!(is_free(to)?, "{} is there already; name a folder that is not there", to.display());
         let beside = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -85,9 +85,9 @@ mod tests {
     use std::io::{Error, ErrorKind};
 
     /// A folder with a file in it under a name of its own, and where it goes.
-    fn placed(beside: &tempfile::TempDir) -> (Place, std::path::PathBuf) {
+    fn placed(beside: &tempfile::TempDir) -> (Staging, std::path::PathBuf) {
         let to = beside.path().join("backup");
-        let place = Place::new(&to).expect("a folder");
+        let place = Staging::new(&to).expect("a folder");
         fs::write(place.path().join("rows"), b"rows").expect("written");
         (place, to)
     }

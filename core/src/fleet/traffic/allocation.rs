@@ -18,7 +18,7 @@ use crate::time::{Now, SiteTime, Utc};
 use crate::work::Live;
 
 /// Serves them in queue order. Each grant is an item of its own.
-pub fn serve_requests(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan) -> Releases {
+pub fn allocate_places(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan) -> Releases {
     let requests = route_requests::in_order(view, board, &now);
     let mut releases = Releases::default();
     let mut occupancy = if requests.is_empty() { Occupancy::default() } else { Occupancy::from_projection(view) };
@@ -27,13 +27,13 @@ pub fn serve_requests(view: &mut FleetProjection, board: &Board, now: Now, plan:
             break;
         }
         let Some(live) = board.get(&request.robot_id) else { continue };
-        plan.decide(view, now, "fleet", |tx| serve_request(tx, live, &mut releases, &mut occupancy));
+        plan.decide(view, now, "fleet", |tx| allocate(tx, live, &mut releases, &mut occupancy));
     }
     plan.report.tally.waiting_for_place = view.waits.len() as u64;
     releases
 }
 
-fn serve_request(tx: &mut Tx, live: &Live, releases: &mut Releases, occupancy: &mut Occupancy) {
+fn allocate(tx: &mut Tx, live: &Live, releases: &mut Releases, occupancy: &mut Occupancy) {
     let robot_id = &live.robot_id;
     let Some(a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
     let Some(work) = route_requests::assignment(tx.view, robot_id, &a).cloned() else { return };

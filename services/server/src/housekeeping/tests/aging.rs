@@ -1,7 +1,7 @@
 //! Nothing that goes by age gets older than it may, on every engine, and positions are as precise as they may be.
 
-use super::oldest::{Oldest, find_oldest};
-use super::{Turn, audit};
+use super::super::oldest::{Oldest, find_oldest};
+use super::super::{Turn, audit};
 use crate::postgres_server::PostgresServer;
 use midshift_core::fleet::rows::FleetMark;
 use midshift_core::ids::{RobotId, SiteId, StopId};
@@ -64,7 +64,7 @@ struct World {
 
 impl World {
     async fn new(wall: Arc<Wall>, store: Arc<dyn Store>, frames: Arc<dyn FrameLog>) -> Self {
-        let site = Arc::new(text::parse(include_str!("../../../../sites/demo.site.toml")).expect("a site"));
+        let site = Arc::new(text::parse(include_str!("../../../../../sites/demo.site.toml")).expect("a site"));
         let parts = midshift_task::Parts { store: store.clone(), site, clock: wall.clone(), bugs: Default::default() };
         let task = TaskService::open(parts, CancellationToken::new()).await.expect("intake");
         Self { wall, store, frames, task, written: 0, latch: Latch::default(), marked: Default::default() }

@@ -27,7 +27,7 @@ const COMMAND: &str = "command";
 
 /// What is closed of one place.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Closure {
+pub struct ClosedPlace {
     /// The place with something closed.
     pub place_id: PlaceId,
     /// In words, with the robots and the command that opens it.
@@ -37,7 +37,7 @@ pub struct Closure {
 }
 
 /// What is closed of the place; none: nothing.
-pub fn find_closure(view: &FleetProjection, place: &Place) -> Option<Closure> {
+pub fn find_closed(view: &FleetProjection, place: &Place) -> Option<ClosedPlace> {
     let of_holder = |h: &PlaceHolder| lost(view, &h.robot_id).map(|a| (h.robot_id.to_string(), a.ended));
     let mut robots: BTreeMap<String, Option<Utc>> = place.holders.iter().filter_map(of_holder).collect();
     let quarantine = place.quarantine.as_ref();
@@ -51,16 +51,16 @@ pub fn find_closure(view: &FleetProjection, place: &Place) -> Option<Closure> {
     let since = robots.values().flatten().min().copied();
     let named: Vec<&str> = robots.keys().take(limits::CROWD_NAMED_MAX).map(String::as_str).collect();
     let command = format!("midshift zone clear {} --reason TEXT --if-match ETAG", place.place_id);
-    let told = describe_closure(place, &named, since, &command);
+    let told = describe_closed(place, &named, since, &command);
     let reason = Reason::new(Code::PlaceQuarantined, told).with(PLACE_ID, &place.place_id).with("seats", seats);
     let reason = reason.with("robots", named.join(" ")).with(COMMAND, command);
     let reason = since.into_iter().fold(reason, |reason, at| reason.with("since", at.rfc3339()));
     let cause = quarantine.and_then(|closed| closed.metadata.get("cause"));
     let reason = cause.into_iter().fold(reason, |reason, cause| reason.with("cause", cause));
-    Some(Closure { place_id: place.place_id.clone(), reason, since })
+    Some(ClosedPlace { place_id: place.place_id.clone(), reason, since })
 }
 
-fn describe_closure(place: &Place, named: &[&str], since: Option<Utc>, command: &str) -> String {
+fn describe_closed(place: &Place, named: &[&str], since: Option<Utc>, command: &str) -> String {
     let (place_id, who) = (&place.place_id, named.join(", "));
     let since = since.map_or_else(String::new, |at| format!(" since {}", at.rfc3339()));
     let what = match place.quarantine {
@@ -81,7 +81,7 @@ fn lost<'v>(view: &'v FleetProjection, robot_id: &RobotId) -> Option<&'v Attempt
     view.attempt(view.held_by(robot_id)?).filter(|a| a.phase == AttemptPhase::Lost)
 }
 
-impl Closure {
+impl ClosedPlace {
     /// `reason` in the words of this closure, with its facts.
     pub fn word_reason(&self, mut reason: Reason) -> Reason {
         reason.message.clone_from(&self.reason.message);
@@ -115,16 +115,16 @@ pub fn name_closed(view: &FleetProjection, reason: Reason) -> Reason {
     // A stop may bar the way as well: then nobody says which of them does.
     let is_alone = || engaged_stops::closed(view).is_empty();
     let on_the_way = || view.places.values().map(|place| &place.row).find(is_shut).filter(|_| is_alone());
-    match goal.or_else(on_the_way).and_then(|place| find_closure(view, place)) {
+    match goal.or_else(on_the_way).and_then(|place| find_closed(view, place)) {
         Some(closure) => closure.word_reason(reason),
         None => reason,
     }
 }
 
 /// Opens an incident of each place that is closed, and closes those of places that are open.
-pub(in crate::fleet) fn tell_closed(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
-    let closed = view.places.values().filter_map(|place| find_closure(view, &place.row));
-    let closed: BTreeMap<String, Closure> = closed.map(|closure| (closure.place_id.to_string(), closure)).collect();
+pub(in crate::fleet) fn keep_incidents(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
+    let closed = view.places.values().filter_map(|place| find_closed(view, &place.row));
+    let closed: BTreeMap<String, ClosedPlace> = closed.map(|closure| (closure.place_id.to_string(), closure)).collect();
     let told = view.incidents.values().map(|i| &i.row).filter(|i| i.reason.code == Code::PlaceQuarantined);
     let told: Vec<Incident> = told.cloned().collect();
     let place_of = |incident: &Incident| incident.reason.metadata.get(PLACE_ID).cloned().unwrap_or_default();

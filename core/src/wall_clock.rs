@@ -12,6 +12,9 @@ use crate::limits;
 use crate::time::{Clock, Doubt, Jump, LinkTime, Now, SiteTime, Utc};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+/// The file of a data folder by which a person says that the wall clock of the machine is right.
+pub const ACCEPTED: &str = "clock-accepted";
+
 impl Jump {
     /// Milliseconds that the wall stepped ahead; negative: back.
     pub const fn step_ms(&self) -> i64 {

@@ -49,7 +49,7 @@ const LIVED: Duration = Duration::from_secs(10);
 const PAUSE_LONGEST: Duration = Duration::from_secs(5);
 
 /// How to start it, and how to reach it.
-pub struct Started {
+pub struct Supervisor {
     /// The site file.
     pub site: Option<PathBuf>,
     /// The data folder.
@@ -62,7 +62,7 @@ pub struct Started {
     pub arguments: Vec<String>,
 }
 
-impl Started {
+impl Supervisor {
     /// Starts it as a process that outlives this one, unless one of this site answers already. None: one does.
     ///
     /// # Errors
@@ -131,7 +131,7 @@ impl Started {
     }
 
     /// Looks after it until the task is ended: one that is gone is started again, before robots among people slow down for want of an answer. `child`: what
-    /// [`Started::start`] has started.
+    /// [`Supervisor::start`] has started.
     pub async fn keep_running(&self, mut child: Option<Child>, store: &dyn Store) {
         let (mut pause, mut watch) = (Duration::ZERO, Watch::default());
         loop {

@@ -3,15 +3,15 @@
 //!
 //! An operational stop request, not a safety function. Invariant: nothing of the store, the task queue or the business
 //! server lies on its way. `serve` starts one where none is, leaves one that answers alone, and replaces one that hangs.
-//! Rooms: `started` is that, `program` finds the program, `first_start` says that one may begin with nothing engaged.
+//! Rooms: `supervisor` is that, `program` finds the program, `first_start` says that one may begin with nothing engaged.
 
 mod first_start;
 mod program;
-mod started;
+mod supervisor;
 
 pub use first_start::{Occasion, announce};
 pub use program::{check_program, replace_this};
-pub use started::Started;
+pub use supervisor::Supervisor;
 
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
