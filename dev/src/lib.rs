@@ -2,7 +2,7 @@
 //! Not for production.
 //!
 //! Invariant: its one door is [`run`], and what the rooms below tell each other goes through none of the server's own
-//! files. Tests alone use [`task_summary`] and [`throwaway`].
+//! files. Of other crates only tests use [`task_summary`] and [`throwaway`].
 
 mod args;
 mod background;

@@ -374,15 +374,11 @@ impl Trusted {
             .await
             .map_err(|e| Error::Metadata(Box::new(e)))?;
         let heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
-        self.check_freshness(&repository, &heard, clock)
+        self.take_fresh(&repository, &heard, clock)
     }
 
-    fn check_freshness(
-        &self,
-        repository: &tough::Repository,
-        heard: &Heard,
-        clock: Reading,
-    ) -> Result<Refreshed, Error> {
+    /// Checks versions and expiry of what was loaded, by a floor of time that its timestamp may raise; makes of it what is kept.
+    fn take_fresh(&self, repository: &tough::Repository, heard: &Heard, clock: Reading) -> Result<Refreshed, Error> {
         let old = parsed(&self.root)?;
         let (root, timestamp) = (repository.root(), repository.timestamp());
         let (snapshot, targets) = (repository.snapshot(), repository.targets());

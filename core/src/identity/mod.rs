@@ -1,7 +1,8 @@
 //! Access rights: roles and their scopes, callers, and the rows of tokens, keys and enrolments.
 //!
 //! Invariants:
-//! 1. Rights are never merged. A right holds only in the scope of the one grant that gives it.
+//! 1. Rights are never merged. A right holds only in the scope of the one grant that gives it; engaging a stop is open
+//!    to every grant.
 //! 2. A token without a grant permits nothing beyond what is open to anybody.
 //! 3. Rows hold digests of secrets, never the secrets.
 //!

@@ -3,7 +3,8 @@
 //! Invariants:
 //! 1. Without descriptors or memory the loop pauses. Each pause is twice the one before, up to a second.
 //! 2. A connection that died in the queue causes no pause.
-//! 3. Every error is counted. The log has the first failure of a series and its end.
+//! 3. Every error is counted. The log has the first failure of a series of the port, and
+//!    its end.
 //!
 //! No spare descriptor is kept for closing peers. A peer in the queue costs nothing and is served once there is room. A
 //! closed peer dials again at once, and another thread may take the freed descriptor first.

@@ -30,7 +30,6 @@ const BYTES_MAX: u64 = limits::STOP_ROBOTS_MAX as u64 * 80;
 
 /// Who belongs to the fleet.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Roster {
     /// At most [`limits::STOP_ROBOTS_MAX`].
     pub robots: BTreeSet<RobotId>,
@@ -48,7 +47,6 @@ impl Roster {
 
 /// Stops that the store has as engaged and not reset: what the service has lost of them it takes from here.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Copied {
     /// By name, each as it was engaged.
     pub stops: Vec<Stop>,
@@ -74,7 +72,6 @@ fn write(folder: &Path, name: &str, bytes: &[u8]) -> io::Result<()> {
 
 /// Who is known, and what the port proves itself with: all that a stop service needs of identity.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Principals {
     /// Tokens and keys that were taken out.
     pub directory: Directory,
@@ -211,5 +208,34 @@ fn apply_roster(inner: &Inner, roster: Result<Roster, String>) {
             inner.touch();
         }
         Err(error) => tracing::error!(error, "the roster cannot be read; the last good one stays in force"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::{Value, from_value, json, to_value};
+
+    /// As a server of the next version may write it, which is there before the stop service is replaced.
+    fn of_next_version(snapshot: &impl Serialize) -> Value {
+        let mut value = to_value(snapshot).expect("JSON");
+        value["of_next_version"] = json!({"some": ["thing"]});
+        value
+    }
+
+    #[test]
+    fn a_field_of_a_newer_server_hides_nothing_that_this_version_knows() {
+        let roster = Roster { robots: [RobotId::parse("r1").expect("an id")].into() };
+        assert_eq!(from_value::<Roster>(of_next_version(&roster)).expect("a roster"), roster);
+        assert!(from_value::<Copied>(of_next_version(&Copied { stops: Vec::new() })).expect("stops").stops.is_empty());
+        let text = |name: &str| name.to_owned();
+        let principals = Principals {
+            directory: Directory::default(),
+            chain_pem: text("chain"),
+            key_pem: text("key"),
+            authority_pem: text("authority"),
+        };
+        let read: Principals = from_value(of_next_version(&principals)).expect("principals");
+        assert_eq!((read.chain_pem, read.key_pem, read.authority_pem), (text("chain"), text("key"), text("authority")));
     }
 }

@@ -1,4 +1,4 @@
-//! Taking part in who leads a service: the law is [`midshift_core::leadership`], and this reads and writes its row.
+//! Taking part in who leads a service: the rules are [`midshift_core::leadership`], and this reads and writes its row.
 //!
 //! Invariant: what was read counts from after the reading, since an answer may take long; what was claimed counts from before the claim.
 

@@ -177,7 +177,11 @@ where
     })
 }
 
-/// One entry of `log` from [`ENTRY_READ`].
+/// What an entry is called whose table this version does not know: nobody asks for that.
+const OF_NEWER_VERSION: &str = "of_newer_version";
+
+/// One entry of `log` from [`ENTRY_READ`]. Of a row whose table only a newer version has, the number and the subject are
+/// kept: it has no table, no body, and no kind that anybody asks for.
 pub(crate) fn entry<'r, R>(log: Log, row: &'r R) -> Result<Entry, sqlx::Error>
 where
     R: sqlx::Row,
@@ -186,13 +190,9 @@ where
     i64: Decode<'r, R::Database> + Type<R::Database>,
 {
     let text = |column: usize| Ok::<_, sqlx::Error>(row.try_get::<Option<&str>, _>(column)?.map(Arc::from));
-    let table = match row.try_get::<Option<&str>, _>(1)? {
-        None => None,
-        Some(name) => {
-            let table = Table::ALL.iter().copied().find(|table| table.name() == name);
-            Some(table.ok_or_else(|| sqlx::Error::Decode(format!("no table is called {name}").into()))?)
-        }
-    };
+    let name = row.try_get::<Option<&str>, _>(1)?;
+    let table = name.and_then(|name| Table::ALL.iter().copied().find(|table| table.name() == name));
+    let is_newer = name.is_some() && table.is_none();
     Ok(Entry {
         seq: seq(row, 0)?,
         log,
@@ -200,8 +200,8 @@ where
         subject: Arc::from(row.try_get::<&str, _>(2)?),
         revision: Revision(row.try_get::<i64, _>(3)?.cast_unsigned()),
         index: Index { state: row.try_get(4)?, parent: text(5)?, order: row.try_get(6)? },
-        body: text(7)?,
-        kind: Arc::from(row.try_get::<&str, _>(8)?),
+        body: text(7)?.filter(|_| !is_newer),
+        kind: Arc::from(if is_newer { OF_NEWER_VERSION } else { row.try_get::<&str, _>(8)? }),
         actor: Arc::from(row.try_get::<&str, _>(9)?),
         request_id: text(10)?,
         at_unix_ms: row.try_get(11)?,

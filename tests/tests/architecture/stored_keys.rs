@@ -69,7 +69,7 @@ const MADE: [&str; 16] = [
 /// Tables with rows of one type each, which a macro or a trait names, by the module of the type.
 const MANY: &[(&str, &[Table])] = &[
     ("audit/chain", &[Table::TaskAudit, Table::FleetAudit, Table::OtaAudit, Table::StopAudit, Table::IdentityAudit]),
-    ("lead", &[Table::FleetLeader, Table::OtaLeader]),
+    ("leadership", &[Table::FleetLeader, Table::OtaLeader]),
     ("idempotency", &[Table::CommandKey, Table::OtaCommandKey]),
 ];
 

@@ -8,8 +8,8 @@
 //!    heard.
 //! 3. Urgent drains begin first, then drains of robots that charge, of robots without work, and of the others; older
 //!    ones first among these.
-//! 4. Drains of people and urgent drains count, and do not wait.
-//! 5. A drain for new software also waits for the area's update window.
+//! 4. Drains of people and urgent drains count, and do not wait for the area.
+//! 5. A drain for new software also waits for the area's update window, unless it is urgent.
 //! 6. A drain away from aborted software waits only for drains that end without a person: one stuck robot would
 //!    otherwise keep it on bad software.
 //! 7. What the area's rules keep in work by capability limits the drains of 6 too.

@@ -17,7 +17,7 @@ use crate::site::PlaceIx;
 use crate::time::{Now, SiteTime, Utc};
 use crate::work::Live;
 
-/// Serves them in queue order. Each grant is an item of its own.
+/// Grants places to all robots that wait, in queue order. Each grant is an item of its own.
 pub fn allocate_places(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan) -> Releases {
     let requests = route_requests::in_order(view, board, &now);
     let mut releases = Releases::default();

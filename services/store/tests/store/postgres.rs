@@ -126,6 +126,36 @@ async fn numbers_taken_without_the_head_row_are_passed_over_by_readers() {
 }
 
 #[tokio::test]
+async fn a_row_of_a_table_of_a_newer_version_hides_no_entry_beside_it() {
+    let config = database().await;
+    let store = postgres_at(&config).await;
+    let head = store.snapshot(&[]).await.unwrap().seq;
+    one(&store, Writer::Fleet, vec![put(Table::Attempt, "a", Expect::Absent, "{}")]).await.unwrap();
+    let newer = head.0.cast_signed() + 2;
+    let row = format!(
+        "INSERT INTO fleet_event (site_id, seq, tbl, subject, revision, body, kind, actor, at_unix_ms) \
+         VALUES ('north', {newer}, 'next_version', 's', 1, '{{}}', 'offered', 'other', 0)"
+    );
+    say(&mut stranger(&config).await, &format!("{LOCK_HEAD}; {row}; {}; COMMIT", move_head(newer))).await;
+    one(&store, Writer::Fleet, vec![put(Table::Attempt, "b", Expect::Absent, "{}")]).await.unwrap();
+
+    let page = store.feed(head, &[Log::Fleet], 10).await.unwrap();
+    let tables: Vec<_> = page.entries.iter().map(|e| (e.table, &*e.subject, e.body.is_some())).collect();
+    assert_eq!(
+        tables,
+        [(Some(Table::Attempt), "a", true), (None, "s", false), (Some(Table::Attempt), "b", true)],
+        "and it is nothing that this version obeys"
+    );
+    assert_ne!(&*page.entries[1].kind, "offered");
+    let (mut after, mut seen) = (head, 0);
+    while after < page.next {
+        let one = store.feed(after, &[Log::Fleet], 1).await.unwrap();
+        (after, seen) = (one.next, seen + one.entries.len());
+    }
+    assert_eq!(seen, 3, "also one at a time");
+}
+
+#[tokio::test]
 async fn a_kept_row_guards_against_another_process() {
     let config = database().await;
     let store = Arc::new(postgres_at(&config).await);
