@@ -1,8 +1,7 @@
 //! Sends the lanes: picks the next batch, limits what is unacknowledged, and applies the server's answers.
 //!
 //! Invariants:
-//! 1. A sample is sent only after it is durable, and in order. After a reconnect, sending goes on from what the server
-//!    has.
+//! 1. A sample is sent only after it is durable, and in order. After a reconnect it goes on from what the server has.
 //! 2. CRITICAL and EVENT need no credit.
 //! 3. STATUS takes one path at a time. What gathered before the session goes over bulk; only then newer STATUS goes on
 //!    the session.

@@ -158,8 +158,7 @@ impl Robots {
         })
     }
 
-    /// Removes robots that left the roster, have no line, and stand by their own silence. Returns whether any was
-    /// removed.
+    /// Removes robots that left the roster, have no line, and stand by their own silence. Returns whether any went.
     pub fn let_go(&self, now: LinkTime) -> bool {
         if !self.read().values().any(|robot| robot.said().is_gone(now)) {
             return false;

@@ -5,8 +5,7 @@
 //! 3. A second machine with another ring lacks the memory of the first. It takes charge only when the authority of the
 //!    first has ended: until then the first may still work, behind a gap in the network.
 //!
-//! Invariant: a robot that restarted or moved is never reported. A copied key or secret never distinguishes the two
-//! machines.
+//! Invariant: a robot that restarted or moved is never reported. A copied key or secret never distinguishes them.
 
 use crate::facts::state;
 use crate::inner::Inner;

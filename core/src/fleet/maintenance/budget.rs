@@ -4,8 +4,7 @@
 //! 1. A waiting drain begins only in an item that also writes its area's row, so two planners cannot both spend the
 //!    last place. That item relies on the drain's request, its release and the area's rules: if one of them changes
 //!    meanwhile, it conflicts.
-//! 2. A robot that is out of work for several reasons counts once. A robot that was written off counts again once it is
-//!    heard.
+//! 2. A robot that is out of work for several reasons counts once. One that was written off counts again once heard.
 //! 3. Urgent drains begin first, then drains of robots that charge, of robots without work, and of the others; older
 //!    ones first among these.
 //! 4. Drains of people and urgent drains count, and do not wait for the area.

@@ -499,8 +499,7 @@ pub fn is_irreversible(view: &RolloutProjection, rollout: &Rollout) -> bool {
     view.bundles.get(rollout.spec.bundle.as_str()).is_some_and(|b| b.row.is_irreversible)
 }
 
-/// Whether no directive for its robots can be signed now, whatever its phase: newcomers of a completed roll-out wait
-/// too.
+/// Whether no directive for its robots can be signed now, whatever its phase: newcomers of a completed one wait too.
 /// False for a roll-out that takes another one back: its robots learnt of the way back with that other one.
 pub fn is_keyless(view: &RolloutProjection, rollout: &Rollout) -> bool {
     view.keyless.is_some() && rollout.revert_of.is_none()
