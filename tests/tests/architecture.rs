@@ -41,8 +41,8 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/stop/src/line.rs", "one task a robot's line: it must outlive the handler that opened it"),
     ("services/stop/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
     ("services/stop/src/threads.rs", "files of the stop service are read and written beside the threads that answer"),
-    ("dev/src/scenario.rs", "`dev` makes releases for a story"),
-    ("dev/src/scenario/watch.rs", "`dev` looks at robots while a story is played"),
+    ("services/dev/src/scenario.rs", "`dev` makes releases for a story"),
+    ("services/dev/src/scenario/watch.rs", "`dev` looks at robots while a story is played"),
     ("services/backup/src/files.rs", "files are copied and read beside the runtime's threads"),
     ("services/server/src/stop_follower.rs", "files of the stop service are read beside the runtime's threads"),
     (
@@ -56,7 +56,7 @@ const SPAWNS: &[(&str, &str)] = &[
     ("services/store/src/sqlite/frames.rs", "the one writer of a file and its checkpoints"),
     ("services/store/src/postgres/mod.rs", "the one writer of a process, and what hears of the others"),
     ("services/store/src/postgres/frames.rs", "the one writer of a process"),
-    ("dev/src/run.rs", "`dev` wires the parts"),
+    ("services/dev/src/run.rs", "`dev` wires the parts"),
     ("services/midshift/src/commands/interrupts.rs", "the binary listens for Ctrl-C"),
 ];
 
@@ -95,8 +95,8 @@ const NAMES_KEPT: &[(&str, &str)] = &[
 const LINES_MAX: usize = 600;
 
 /// Folders of what runs on servers, at people's and on robots: not tests, benchmarks and xtask.
-const ROOMS: [&str; 11] =
-    ["cli", "core", "dev", "durable", "latch", "os", "ota_bundles", "proto", "robot_agent", "robot_sim", "services"];
+const ROOMS: [&str; 10] =
+    ["cli", "core", "durable", "latch", "os", "ota_bundles", "proto", "robot_agent", "robot_sim", "services"];
 
 /// Sources of these rooms that are compiled into programs, and tests that stand among them.
 fn of_rooms(rooms: &[&str]) -> impl Iterator<Item = String> {
@@ -391,7 +391,7 @@ fn code(text: &str) -> String {
 fn tasks_are_spawned_where_a_service_runs_and_nowhere_else() {
     let spawns = ["tokio::spawn(", "task::spawn(", "spawn_blocking(", "spawn_local(", "thread::spawn(", "JoinSet"];
     let is_test = |path: &String| path.ends_with("/tests.rs") || path.contains("/tests/");
-    for path in of_rooms(&["cli", "dev", "services"]).filter(|path| !is_test(path)) {
+    for path in of_rooms(&["cli", "services"]).filter(|path| !is_test(path)) {
         let text = code(&read(&path));
         let found = spawns.iter().find(|s| text.contains(*s));
         let may = path.ends_with("/src/lib.rs") || SPAWNS.iter().any(|(known, _)| *known == path);

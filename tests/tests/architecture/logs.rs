@@ -66,7 +66,7 @@ const LOGGED: &[(&str, &str, &str)] = &[
     ("robot_sim/src/swarm.rs", "why", "what the operating system said of a program"),
     ("services/fleet/src/reconcile.rs", "text", "the key of a row, and what could not be read of it"),
     ("services/fleet/src/standby.rs", "text", "the key of a row, and what could not be read of it"),
-    ("dev/src/lib.rs", "warning", "what the lint says of the site's own file"),
+    ("services/dev/src/lib.rs", "warning", "what the lint says of the site's own file"),
     ("services/midshift/src/robots.rs", "deed", "a word and an id"),
     ("services/server/src/serve.rs", "warning", "what the lint says of the site's own file"),
     ("services/ota/src/repository.rs", "why", "one of a closed list of words"),
