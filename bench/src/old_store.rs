@@ -235,7 +235,8 @@ async fn cancel_all(tasks: &mut TaskServiceClient<Channel>) -> anyhow::Result<()
     let mut page_token = String::new();
     loop {
         let reason = "the measurement is over".to_owned();
-        let request = CancelTasksRequest { reason, force: true, page_token, ..CancelTasksRequest::default() };
+        let request =
+            CancelTasksRequest { reason, force: true, all: true, page_token, ..CancelTasksRequest::default() };
         page_token = tasks.cancel_tasks(request).await?.into_inner().outcome.context("no outcome")?.next_page_token;
         if page_token.is_empty() {
             return Ok(());

@@ -106,6 +106,9 @@ fn robots_of(key: &Key, body: &Value) -> BTreeSet<RobotId> {
 
 fn tasks_of(key: &Key, body: &Value) -> BTreeSet<TaskId> {
     let own = matches!(key.table, Table::TaskState | Table::TaskIntake).then_some(&*key.id);
-    let named = body["task_id"].as_str();
+    // A request says it below the word of what is asked.
+    let asked = body["ask"].as_object().into_iter().flatten().map(|(_, ask)| ask);
+    let listed = asked.clone().filter_map(|ask| ask["task_ids"].as_array()).flatten();
+    let named = asked.map(|ask| &ask["task_id"]).chain(listed).chain([&body["task_id"]]).filter_map(Value::as_str);
     own.into_iter().chain(named).filter_map(|id| TaskId::parse(id).ok()).collect()
 }

@@ -17,6 +17,7 @@ pub async fn cancel(which: &Which, reason: &str, force: bool, change: &Change, o
         force,
         validate_only: change.dry_run,
         page_token: String::new(),
+        all: true,
     };
     let ask = async |page_token| {
         let request = v1::CancelTasksRequest { page_token, ..request.clone() };
@@ -41,6 +42,7 @@ pub async fn resolve(
         reason: reason.to_owned(),
         validate_only: change.dry_run,
         page_token: String::new(),
+        all: true,
     };
     let ask = async |page_token| {
         let request = v1::ResolveTasksRequest { page_token, ..request.clone() };

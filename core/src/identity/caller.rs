@@ -1,6 +1,6 @@
 //! Who asks, and what it may.
 
-use super::grant::{Access, Grant, Permission, Scope};
+use super::grant::{Access, Grant, HeldGrant, Permission, Scope};
 use super::token::{Digest, TokenId};
 use crate::ids::{AreaId, RobotId};
 use crate::reason::{Code, Kind, Reason, Refusal};
@@ -29,7 +29,7 @@ pub enum Who {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Caller {
     who: Who,
-    grants: Arc<[Grant]>,
+    grants: Arc<[HeldGrant]>,
     /// Its token's time is over, for less than [`crate::limits::TOKEN_STOPS_AFTER_EXPIRY`]: it may engage stops and nothing else.
     expired: bool,
     certificate: Option<Arc<str>>,
@@ -64,7 +64,7 @@ impl Caller {
         Self { key: Some(key), ..self }
     }
     /// The holder of a token; of one that is `expired`, it may still engage stops.
-    pub fn holder(token: TokenId, name: Arc<str>, grants: Arc<[Grant]>, expired: bool) -> Self {
+    pub fn holder(token: TokenId, name: Arc<str>, grants: Arc<[HeldGrant]>, expired: bool) -> Self {
         Self { grants, expired, ..Self::without_grants(Who::Holder { token, name }) }
     }
     /// The same as one person's, who may have several tokens. None: its name stands for itself.
@@ -97,8 +97,11 @@ impl Caller {
         self.expired
     }
     /// Its grants.
-    pub fn grants(&self) -> &[Grant] {
+    pub fn grants(&self) -> &[HeldGrant] {
         &self.grants
+    }
+    fn known_grants(&self) -> impl Iterator<Item = &Grant> {
+        self.grants.iter().filter_map(HeldGrant::known)
     }
 
     /// Whether a method with this rule is for it at all, somewhere. Of what it may be asked is held against [`Caller::may_over`] where the object is known;
@@ -116,7 +119,7 @@ impl Caller {
             (Who::Holder { .. }, _) if self.expired => {
                 return Err(Refusal::new(Kind::Unauthenticated, Code::TokenExpired));
             }
-            (Who::Holder { .. }, needed) => self.grants.iter().any(|grant| {
+            (Who::Holder { .. }, needed) => self.known_grants().any(|grant| {
                 grant.role.permits(needed) && (access.object != super::Object::Site || grant.scope == Scope::Site)
             }),
         };
@@ -130,7 +133,7 @@ impl Caller {
             return true;
         }
         let permits = |area: Option<&AreaId>| {
-            self.grants.iter().any(|grant| {
+            self.known_grants().any(|grant| {
                 grant.role.permits(permission) && area.map_or(grant.scope == Scope::Site, |area| grant.scope.has(area))
             })
         };
@@ -217,7 +220,7 @@ mod tests {
     }
 
     fn holder(grants: &[&str]) -> Caller {
-        let grants = grants.iter().map(|grant| grant.parse().expect("a grant")).collect();
+        let grants = grants.iter().map(|grant| HeldGrant::from((*grant).to_owned())).collect();
         Caller::holder(TokenId::new("t1").expect("an id"), "anna".into(), grants, false)
     }
 
@@ -251,6 +254,15 @@ mod tests {
     }
 
     #[test]
+    fn a_grant_of_a_newer_version_permits_nothing_but_what_everybody_signed_in_may() {
+        let scanner = holder(&["scanner", "viewer@wall:7 8"]);
+        assert_eq!(scanner.grants()[1].to_string(), "viewer@wall:7 8", "it is kept as it was");
+        assert!(scanner.may_call(rule(Permission::Read, Object::List)).is_err());
+        assert!(!scanner.may_over(Permission::Read, &[area("packing")]));
+        assert!(scanner.may_call(rule(Permission::Stop, Object::None)).is_ok());
+    }
+
+    #[test]
     fn what_is_asked_of_the_site_needs_a_grant_of_the_site() {
         let site = rule(Permission::Administer, Object::Site);
         assert!(holder(&["admin"]).may_call(site).is_ok());
@@ -280,7 +292,7 @@ mod tests {
 
     #[test]
     fn a_token_whose_time_is_over_still_stops_and_does_nothing_else() {
-        let grants: Arc<[Grant]> = Arc::from(["stop-resetter".parse().expect("a grant")]);
+        let grants: Arc<[HeldGrant]> = Arc::from(["stop-resetter".to_owned().into()]);
         let late = Caller::holder(TokenId::new("t1").expect("an id"), "anna".into(), grants, true);
         assert!(late.may_call(rule(Permission::Stop, Object::None)).is_ok());
         let refused = late.may_call(rule(Permission::Reset, Object::None)).expect_err("late");

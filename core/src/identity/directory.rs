@@ -4,7 +4,7 @@
 
 use super::caller::Caller;
 use super::enrolment::{Deny, RobotIdentity};
-use super::grant::Grant;
+use super::grant::HeldGrant;
 use super::rows::TokenRecord;
 use super::token::{Digest, TokenId};
 use crate::limits;
@@ -29,7 +29,7 @@ pub struct DirectoryToken {
     /// Digest of its secret.
     pub digest: Digest,
     /// Its rights.
-    pub grants: Arc<[Grant]>,
+    pub grants: Arc<[HeldGrant]>,
     /// When its time is over.
     pub expires_unix_ms: i64,
 }
@@ -109,7 +109,7 @@ mod tests {
 
     fn directory() -> (TokenId, Directory) {
         let id = TokenId::new("t1").expect("an id");
-        let grants = Arc::from(["operator".parse().expect("a grant")]);
+        let grants = Arc::from(["operator".to_owned().into()]);
         let (name, digest, person) = ("anna".into(), Digest([7; 32]), None);
         let token = DirectoryToken { name, person, digest, grants, expires_unix_ms: DAY_MS };
         (id.clone(), Directory { tokens: [(id, token)].into(), denied: BTreeMap::new() })
@@ -149,7 +149,7 @@ mod tests {
             name: "anna".to_owned(),
             person: None,
             digest: Digest([7; 32]),
-            grants: vec!["viewer".parse().expect("a grant")],
+            grants: vec!["viewer".to_owned().into()],
             created_unix_ms: 0,
             created_by: "bert".to_owned(),
             expires_unix_ms: DAY_MS,

@@ -142,6 +142,53 @@ pub struct Grant {
     pub scope: Scope,
 }
 
+/// A grant as rows and ports hold it.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(from = "String", into = "String")]
+pub enum HeldGrant {
+    /// One that this version knows.
+    Known(Grant),
+    /// One of a newer version: it permits nothing here, and is written back as it was.
+    Newer(String),
+}
+
+impl HeldGrant {
+    /// The grant; none: it is of a newer version.
+    pub const fn known(&self) -> Option<&Grant> {
+        match self {
+            Self::Known(grant) => Some(grant),
+            Self::Newer(_) => None,
+        }
+    }
+}
+
+impl From<String> for HeldGrant {
+    fn from(text: String) -> Self {
+        text.parse().map_or(Self::Newer(text), Self::Known)
+    }
+}
+
+impl From<Grant> for HeldGrant {
+    fn from(grant: Grant) -> Self {
+        Self::Known(grant)
+    }
+}
+
+impl From<HeldGrant> for String {
+    fn from(grant: HeldGrant) -> Self {
+        grant.to_string()
+    }
+}
+
+impl fmt::Display for HeldGrant {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Known(grant) => grant.fmt(f),
+            Self::Newer(text) => f.write_str(text),
+        }
+    }
+}
+
 /// A grant that cannot be read.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(

@@ -23,7 +23,7 @@ pub use actor::Actor;
 pub use caller::{Caller, Who};
 pub use directory::{Directory, DirectoryToken};
 pub use enrolment::{Deny, EnrolmentState, Replace, RobotIdentity};
-pub use grant::{Access, Grant, Object, Permission, Role, Scope};
+pub use grant::{Access, Grant, HeldGrant, Object, Permission, Role, Scope};
 pub use proof::ServerProof;
 pub use revocation::{Revocation, revocations};
 pub use rows::{Act, Authority, Rotation, ServerCertificate, TokenName, TokenRecord};

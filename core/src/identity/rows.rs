@@ -1,6 +1,6 @@
 //! Rows of tokens, of the site's authority, and of certificates of servers.
 
-use super::grant::Grant;
+use super::grant::HeldGrant;
 use super::token::{Digest, TokenId};
 use crate::limits;
 use crate::rows::{Index, Record, Table, body_is_json};
@@ -38,7 +38,7 @@ pub struct TokenRecord {
     /// Of its secret.
     pub digest: Digest,
     /// Its rights.
-    pub grants: Vec<Grant>,
+    pub grants: Vec<HeldGrant>,
     /// UTC, unix ms.
     pub created_unix_ms: i64,
     /// Who made it.

@@ -178,7 +178,7 @@ pub enum AttemptPhase {
 
 impl AttemptPhase {
     /// All phases.
-    pub const ALL: [AttemptPhase; 12] = [
+    pub const ALL: [AttemptPhase; Self::Docked as usize + 1] = [
         Self::Offered,
         Self::Accepted,
         Self::Navigating,
@@ -191,6 +191,7 @@ impl AttemptPhase {
         Self::Failed,
         Self::Aborted,
         Self::Lost,
+        Self::Docked,
     ];
     /// No way out.
     pub const fn is_terminal(self) -> bool {

@@ -23,7 +23,7 @@ fn paths() -> Vec<(String, Access)> {
 
 fn holder(role: Role, scope: Scope) -> Caller {
     let token = TokenId::new("t1").expect("an id");
-    Caller::holder(token, "anna".into(), [Grant { role, scope }].into(), false)
+    Caller::holder(token, "anna".into(), [Grant { role, scope }.into()].into(), false)
 }
 
 /// Whether the object of a method lies in areas, so that a service asks about it.

@@ -290,7 +290,7 @@ fn known() -> (TokenRecord, RobotIdentity) {
         name: "anna".to_owned(),
         person: None,
         digest: KeyDigest([7; 32]),
-        grants: vec!["operator".parse().expect("a grant")],
+        grants: vec!["operator".to_owned().into()],
         created_unix_ms: NOW.0,
         created_by: "bert".to_owned(),
         expires_unix_ms: NOW.0 + 1_000_000,

@@ -8,6 +8,7 @@ use crate::answer::Speech;
 use crate::config::{Config, std};
 use crate::deadline::{self, Bounded, Over};
 use crate::denials::{self, Denials};
+use crate::features;
 use crate::peer::{Peer, Principals};
 use crate::quota::{Full, Quota, Slot, network};
 use crate::quota_key::QuotaKey;
@@ -182,6 +183,7 @@ impl Door {
             self.denied(&key, caller.as_ref().ok(), path, refusal);
         }
         allowed?;
+        features::check(headers)?;
         admitted.slot.batch = self.batch(path)?;
         Ok((caller?, admitted))
     }

@@ -7,7 +7,7 @@ pub mod rotate;
 use crate::register::{Register, View, decided};
 use midshift_core::audit::Note;
 use midshift_core::identity::{
-    Act, Actor, Digest, Grant, Permission, Role, Scope, Secret, TokenId, TokenName, TokenRecord,
+    Act, Actor, Digest, Grant, HeldGrant, Permission, Role, Scope, Secret, TokenId, TokenName, TokenRecord,
 };
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
@@ -110,7 +110,7 @@ impl Wanted {
             name: self.name.clone(),
             person: self.person.clone(),
             digest: digest(secret),
-            grants: self.grants.clone(),
+            grants: self.grants.iter().cloned().map(Into::into).collect(),
             created_unix_ms: now.0,
             created_by: actor.to_string(),
             expires_unix_ms: now.0.saturating_add_unsigned(self.valid.as_ms()),
@@ -258,7 +258,9 @@ pub async fn revoke(register: &Register, token_id: &TokenId, by: &Actor, now: Ut
 /// Whether it may administer the site, now.
 pub fn administers(token: &TokenRecord, now: Utc) -> bool {
     let gives = |grant: &Grant| grant.role.permits(Permission::Administer) && grant.scope == Scope::Site;
-    token.revoked.is_none() && token.expires_unix_ms > now.0 && token.grants.iter().any(gives)
+    token.revoked.is_none()
+        && token.expires_unix_ms > now.0
+        && token.grants.iter().filter_map(HeldGrant::known).any(gives)
 }
 
 /// All of them, newest first, with keys that rise in that order.

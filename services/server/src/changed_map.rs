@@ -19,7 +19,9 @@ pub async fn choose(
     is_forced: bool,
     now: Now,
 ) -> anyhow::Result<(Loaded, MapChange)> {
-    let Some((row, stored)) = other_stored(store, &loaded).await? else { return Ok((loaded, MapChange::Taken)) };
+    let Some((row, stored)) = other_stored(store, &loaded, is_forced).await? else {
+        return Ok((loaded, MapChange::Taken));
+    };
     let snapshot = store.read(&alive(), named).await.context("reading what is in the way of the changed map")?;
     let mut view = FleetProjection::new(stored.clone(), now, now);
     view.load(&snapshot.rows, snapshot.seq).context("reading what is in the way of the changed map")?;
@@ -45,22 +47,30 @@ pub async fn choose(
 
 /// The map of a process that does not plan: the stored one, which fleet plans on, whatever its own file says.
 pub async fn follow(store: &dyn Store, loaded: Loaded) -> anyhow::Result<Loaded> {
-    let Some((row, stored)) = other_stored(store, &loaded).await? else { return Ok(loaded) };
+    let Some((row, stored)) = other_stored(store, &loaded, false).await? else { return Ok(loaded) };
     let (version, stored_version) = (loaded.site.map_version(), &row.map_version);
     tracing::info!(map_version = version, stored = stored_version, "the stored map goes on, whatever the file says");
     Ok(Loaded { site: stored, text: row.text, warnings: Vec::new() })
 }
 
-/// The stored map, if it is another one than that of the file and can be read.
-async fn other_stored(store: &dyn Store, loaded: &Loaded) -> anyhow::Result<Option<(SiteRow, Arc<Site>)>> {
+/// The stored map, if it is another one than that of the file. One that cannot be read, since a newer version wrote it,
+/// is an error, or none if the file's is forced.
+async fn other_stored(
+    store: &dyn Store,
+    loaded: &Loaded,
+    is_forced: bool,
+) -> anyhow::Result<Option<(SiteRow, Arc<Site>)>> {
     let row = load::<SiteRow>(store, loaded.site.site_id().as_str()).await.context("reading the stored map")?;
     let Some((row, _)) = row.filter(|(row, _)| row.text != loaded.text) else { return Ok(None) };
     match read_stored(row.site_id.as_str(), &row.text) {
         Ok(stored) => Ok(Some((row, Arc::new(stored)))),
-        Err(error) => {
-            tracing::warn!(%error, "the stored map is no site file, so nobody can say what is in the way of the file's: that is taken");
+        Err(error) if is_forced => {
+            tracing::warn!(%error, "the stored map cannot be read, so nobody can say what is in the way of the file's, which is forced");
             Ok(None)
         }
+        Err(error) => Err(error).context(
+            "the stored map cannot be read: a newer version may have written it\n  try: start that version; or --force-map takes the map of the file, whatever is in its way",
+        ),
     }
 }
 
@@ -126,6 +136,23 @@ mod tests {
         let not_taken = MapChange::NotTaken { version: "2".to_owned(), obstacles: obstacles.clone() };
         assert_eq!(choose(under_it.clone(), false).await, ("1".to_owned(), not_taken));
         assert_eq!(choose(under_it, true).await, ("2".to_owned(), MapChange::Forced { obstacles }));
+    }
+
+    #[tokio::test]
+    async fn a_stored_map_that_only_a_newer_version_can_read_is_replaced_by_force_alone() {
+        let store = store().await;
+        let newer = CORRIDOR.replace("map_version", "gravity = 3\nmap_version");
+        let row = load::<SiteRow>(&store, "corridor").await.expect("readable").expect("a row");
+        let mut item = Item::new(Writer::Fleet, "tests");
+        item.update(&SiteRow { text: newer, ..row.0 }, row.1, "site.loaded");
+        store.commit(vec![item]).await.pop().expect("a result").expect("applied");
+        let own = || loaded(CORRIDOR.to_owned());
+        let refused =
+            choose(&store, own(), false, Now::default()).await.expect_err("nobody can say what is in the way");
+        assert!(format!("{refused:#}").contains("--force-map"), "{refused:#}");
+        assert!(follow(&store, own()).await.is_err());
+        let (taken, change) = choose(&store, own(), true, Now::default()).await.expect("forced");
+        assert_eq!((taken.text.as_str(), change), (CORRIDOR, MapChange::Taken));
     }
 
     #[tokio::test]

@@ -1,5 +1,8 @@
 //! The audit of stops: one line a record, each with the hash of the one before it, durable before the answer when the disk lets it be.
 //!
+//! A hash is SHA-256 over the line up to `,"hash":`, which has the hash of the line before it as `prev`. So a line of a
+//! newer version, with a word or a field more, holds here too.
+//!
 //! Invariant: nothing of it is ever changed or taken away by the service; where it had to leave records out it says how many. The hash of the last
 //! record is also kept in the latch file, so that a file whose end was cut off shows. Called by the one writer of the folder, and by `verify`.
 
@@ -16,6 +19,8 @@ use std::path::{Path, PathBuf};
 
 /// Its name in the folder.
 pub const NAME: &str = "audit.jsonl";
+/// What the first record has for the hash before it.
+const FIRST_PREV: &str = "0000000000000000000000000000000000000000000000000000000000000000";
 /// Bytes of a line at most: a request of 64 KiB is refused long before.
 const LINE_BYTES_MAX: u64 = 64 * 1024;
 
@@ -80,45 +85,54 @@ impl Note {
     }
 }
 
-/// One record as it stands in a line.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Record {
+/// One record as it is written, but for its hash.
+#[derive(Serialize)]
+struct Record<'n> {
     n: u64,
     at_unix_ms: i64,
-    actor: String,
+    actor: &'n str,
     action: Action,
-    fields: BTreeMap<String, String>,
+    fields: &'n BTreeMap<String, String>,
+    prev: &'n str,
+}
+
+/// What of a record chains it to the others. A newer version may say more in it than this one knows.
+#[derive(Clone, Debug, Deserialize)]
+struct Link {
+    n: u64,
     prev: String,
     hash: String,
 }
 
-#[derive(Serialize)]
-struct Hashed<'a>(u64, i64, &'a str, Action, &'a BTreeMap<String, String>);
-
-impl Record {
-    fn new(n: u64, note: &Note, prev: String) -> Self {
-        let Note { at, actor, action, fields } = note.clone();
-        let mut record = Self { n, at_unix_ms: at.0, actor, action, fields, prev, hash: String::new() };
-        record.hash = record.expected();
-        record
-    }
-    /// SHA-256 over the hash before and the rest as JSON, hexadecimal.
-    fn expected(&self) -> String {
-        let rest = Hashed(self.n, self.at_unix_ms, &self.actor, self.action, &self.fields);
-        let mut digest = Sha256::new();
-        digest.update(self.prev.as_bytes());
-        digest.update(json(&rest));
-        digest.finalize().iter().fold(String::with_capacity(64), |mut hex, byte| {
-            let _ = write!(hex, "{byte:02x}");
-            hex
-        })
+impl Link {
+    /// The record of a line; none if it is not as it was written.
+    fn read(line: &[u8]) -> Option<Self> {
+        let link: Self = serde_json::from_slice(line).ok()?;
+        let end = format!("{HASH}{}\"}}", link.hash);
+        let hashed = line.strip_suffix(end.as_bytes())?;
+        (link.hash == hash(hashed)).then_some(link)
     }
 }
 
-/// Text, numbers and maps of text: nothing that JSON cannot hold.
-fn json(value: &impl Serialize) -> Vec<u8> {
-    serde_json::to_vec(value).unwrap_or_else(|e| unreachable!("plain values: {e}"))
+/// Between what is hashed and the hash.
+const HASH: &str = ",\"hash\":\"";
+
+/// SHA-256, hexadecimal.
+fn hash(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().fold(String::with_capacity(64), |mut hex, byte| {
+        let _ = write!(hex, "{byte:02x}");
+        hex
+    })
+}
+
+/// The line of a record, and its hash.
+fn line_of(record: &Record<'_>) -> (Vec<u8>, String) {
+    // Text, numbers and maps of text: nothing that JSON cannot hold.
+    let mut line = serde_json::to_vec(record).unwrap_or_else(|e| unreachable!("plain values: {e}"));
+    line.pop();
+    let hash = hash(&line);
+    line.extend(format!("{HASH}{hash}\"}}\n").bytes());
+    (line, hash)
 }
 
 /// The last record of an audit.
@@ -183,11 +197,12 @@ impl Audit {
         let Some(file) = &self.file else { return Err(io::ErrorKind::NotFound.into()) };
         let (mut bytes, mut tail) = (Vec::new(), self.tail.clone());
         for note in found.iter().chain(notes) {
-            let prev = if tail.hash.is_empty() { "0".repeat(64) } else { tail.hash };
-            let record = Record::new(tail.n + 1, note, prev);
-            bytes.extend(json(&record));
-            bytes.push(b'\n');
-            tail = Tail { n: record.n, hash: record.hash };
+            let prev = if tail.hash.is_empty() { FIRST_PREV } else { &tail.hash };
+            let Note { at, actor, action, fields } = note;
+            let (n, at_unix_ms) = (tail.n + 1, at.0);
+            let (line, hash) = line_of(&Record { n, at_unix_ms, actor, action: *action, fields, prev });
+            bytes.extend(line);
+            tail = Tail { n, hash };
         }
         if let Err(error) = file.write_all_at(&bytes, self.length).and_then(|()| file.sync_data()) {
             // Making a file shorter needs no room.
@@ -203,13 +218,13 @@ impl Audit {
 }
 
 /// Length up to the end of the last whole line, and its record.
-fn last_line(file: &File, bytes: u64) -> io::Result<(u64, Option<Record>)> {
+fn last_line(file: &File, bytes: u64) -> io::Result<(u64, Option<Link>)> {
     let from = bytes.saturating_sub(2 * LINE_BYTES_MAX);
     let mut end = vec![0; (bytes - from) as usize];
     file.read_exact_at(&mut end, from)?;
     let Some(last) = end.iter().rposition(|b| *b == b'\n') else { return Ok((from, None)) };
     let line = end[..last].rsplit(|b| *b == b'\n').next().unwrap_or_default();
-    Ok((from + last as u64 + 1, serde_json::from_slice(line).ok()))
+    Ok((from + last as u64 + 1, Link::read(line)))
 }
 
 /// What is wrong with an audit.
@@ -293,12 +308,12 @@ pub fn verify(folder: &Path, known: &Tail) -> Result<Verified, Broken> {
         }
         let expected = last.n + 1;
         let line = text.strip_suffix(b"\n").unwrap_or(&text);
-        let record: Record = serde_json::from_slice(line).map_err(|_| Broken::Altered { line: expected })?;
+        let record = Link::read(line).ok_or(Broken::Altered { line: expected })?;
         if record.n != expected {
             return Err(Broken::Order { line: expected, found: record.n, expected });
         }
-        let follows = if expected == 1 { record.prev == "0".repeat(64) } else { record.prev == last.hash };
-        if !follows || record.hash != record.expected() || json(&record) != line {
+        let prev = if expected == 1 { FIRST_PREV } else { &last.hash };
+        if record.prev != prev {
             return Err(Broken::Altered { line: expected });
         }
         if record.n == known.n && record.hash != known.hash {
@@ -386,6 +401,22 @@ mod tests {
         assert!(matches!(verify(folder.path(), &tail), Err(Broken::Rewritten { n: 5 })), "all lines anew");
         write(folder.path(), &good);
         assert_eq!(verify(folder.path(), &tail).unwrap().records, 5);
+    }
+
+    #[test]
+    fn a_line_of_a_newer_version_holds_and_is_followed() {
+        let folder = tempfile::tempdir().unwrap();
+        let tail = written(folder.path(), 1);
+        let text = format!("{{\"n\":2,\"action\":\"PRAISED\",\"more\":[7],\"prev\":\"{}\"", tail.hash);
+        let line = format!("{text},\"hash\":\"{}\"}}", hash(text.as_bytes()));
+        let good: Vec<String> = lines(folder.path()).into_iter().chain([line]).collect();
+        write(folder.path(), &good);
+        let (mut audit, found) = Audit::open(folder.path(), tail.clone(), Utc(0));
+        assert!(found.is_empty(), "nothing is lost: {found:?}");
+        audit.append(&notes(1), Utc(0)).unwrap();
+        assert_eq!(verify(folder.path(), audit.tail()).unwrap().records, 3);
+        write(folder.path(), &[good[0].clone(), good[1].replace("PRAISED", "BLAMED")]);
+        assert!(matches!(verify(folder.path(), &tail), Err(Broken::Altered { line: 2 })));
     }
 
     #[test]

@@ -105,6 +105,13 @@ fn cursor_of(token: &str, bad: &mut Violations) -> Option<Cursor> {
     cursor
 }
 
+/// A filter that a caller has forgotten, or that only a newer version can read, does not mean every task.
+fn check_filter(filter: Option<&v1::TaskFilter>, all: bool, bad: &mut Violations) {
+    if !all && filter.is_none_or(|filter| *filter == v1::TaskFilter::default()) {
+        bad.add("filter", "says nothing: set all to mean every task");
+    }
+}
+
 impl TaskService {
     /// Asks for the end of all tasks that are meant.
     pub async fn cancel_many(
@@ -116,6 +123,7 @@ impl TaskService {
         reason_text(&r.reason, &mut bad);
         let request_id = shared_id(&r.request_id, &mut bad);
         let after = cursor_of(&r.page_token, &mut bad);
+        check_filter(r.filter.as_ref(), r.all, &mut bad);
         bad.finish()?;
         let same = v1::CancelTasksRequest {
             request_id: String::new(),
@@ -141,6 +149,7 @@ impl TaskService {
         reason_text(&r.reason, &mut bad);
         let request_id = shared_id(&r.request_id, &mut bad);
         let after = cursor_of(&r.page_token, &mut bad);
+        check_filter(r.filter.as_ref(), r.all, &mut bad);
         let resolution = Resolution::from_wire(r.resolution);
         if resolution.is_none() {
             bad.add("resolution", "is required");

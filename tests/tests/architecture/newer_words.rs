@@ -5,11 +5,12 @@ use crate::{files, read};
 /// What this build does with a word of a newer version where such an enum is read.
 const WORDS: &[(&str, &[&str])] = &[
     // Kept in the value itself.
-    ("kept", &["FaultClass", "WorkState"]),
+    ("kept", &["FaultClass", "HeldGrant", "WorkState"]),
     // The row stands aside: core/src/unknown_rows.rs. A robot's ledger and what lies in an inbox are its own to refuse.
     (
         "aside",
         &[
+            "Ask",
             "AttemptPhase",
             "DrainState",
             "Duty",
@@ -50,7 +51,6 @@ const WORDS: &[(&str, &[&str])] = &[
         "refused",
         &[
             "AbortScope",
-            "Ask",
             "Command",
             "Kind",
             "Revocation",

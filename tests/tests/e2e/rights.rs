@@ -8,7 +8,7 @@ use crate::robots::{Robots, enrolled};
 use crate::rolled_out::{call, done};
 use crate::stopped::StopServer;
 use anyhow::{Context, ensure};
-use midshift_core::identity::{Caller, Grant, Object, Permission, Role, Scope, TokenId};
+use midshift_core::identity::{Caller, Grant, HeldGrant, Object, Permission, Role, Scope, TokenId};
 use midshift_core::ids::{AreaId, RobotId};
 use midshift_core::reason::Code as Said;
 use midshift_core::site::DEMO;
@@ -58,7 +58,7 @@ fn everybody(
         (Somebody::with(ASKS, Caller::robot(RobotId::parse(ASKS)?), port, robot.clone())?, None),
     ];
     for ((role, scope), token) in tokens {
-        let grants = [Grant { role: *role, scope: scope.clone() }];
+        let grants = [HeldGrant::Known(Grant { role: *role, scope: scope.clone() })];
         let name = name(*role, scope);
         let caller = Caller::holder(TokenId::new("t1").context("an id")?, name.as_str().into(), grants.into(), false);
         all.push((Somebody::new(&name, caller, port, Some(token))?, Some(scope.clone())));

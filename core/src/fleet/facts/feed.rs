@@ -12,7 +12,7 @@ use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::arrivals;
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
-use crate::rows::{BadRow, Entry, Item, Key, Log, Row, Seq, Table};
+use crate::rows::{BadRow, Entry, Item, Key, Log, Revision, Row, Seq, Table};
 use crate::task::TaskRequest;
 use crate::time::Now;
 use crate::work::InboxEntry;
@@ -53,14 +53,22 @@ pub fn absorb(view: &mut FleetProjection, now: Now, board: &Board, entries: &[En
                     lose_word(view, now, entry, plan);
                 }
             },
-            (Log::Task, Some(Table::TaskRequest), Some(body)) => match serde_json::from_str::<TaskRequest>(body) {
-                Ok(request) => {
-                    if !requests::obey_request(view, now, &request, entry, plan) {
-                        plan.decide(view, now, "fleet", |tx| pass_over(tx, entry));
+            (Log::Task, Some(Table::TaskRequest), Some(body)) => {
+                let key = Key::new(Table::TaskRequest, &*entry.subject);
+                let row = Row { key, revision: Revision(1), index: entry.index.clone(), body: body.clone() };
+                match row.decode::<TaskRequest>() {
+                    Ok(request) => {
+                        if !requests::obey_request(view, now, &request, entry, plan) {
+                            plan.decide(view, now, "fleet", |tx| pass_over(tx, entry));
+                        }
+                    }
+                    // A newer version knows the word. Until then nothing else is done with its tasks.
+                    Err(error) => {
+                        plan.report.unreadable.push(format!("request {}: {error}", entry.seq.0));
+                        view.unknown_rows.keep_aside(&row, &error);
                     }
                 }
-                Err(error) => plan.report.unreadable.push(format!("request {}: {error}", entry.seq.0)),
-            },
+            }
             (Log::Telemetry, None, _) if matches!(&*entry.kind, CLONE_SEEN | NOT_ENROLLED_SEEN | REPORT_TOO_LONG) => {
                 plan.decide(view, now, "fleet", |tx| {
                     let robot_id = RobotId::parse(&entry.subject).ok();

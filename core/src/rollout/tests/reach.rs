@@ -8,7 +8,7 @@ use crate::rollout::requests::{Ask, CheckOnly};
 use crate::rollout::rows::Act;
 
 fn holder(name: &str, grants: &[&str]) -> Caller {
-    let grants = grants.iter().map(|grant| grant.parse().expect("a grant")).collect();
+    let grants = grants.iter().map(|grant| (*grant).to_owned().into()).collect();
     Caller::holder(TokenId::new("t1").expect("an id"), name.into(), grants, false)
 }
 

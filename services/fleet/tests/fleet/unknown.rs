@@ -105,3 +105,23 @@ async fn a_presence_of_a_newer_version_keeps_no_robot_from_work() {
     w.submit("T1", "A", "B").await;
     w.until_phase("T1", Phase::Succeeded).await;
 }
+
+#[tokio::test(start_paused = true)]
+async fn a_task_of_which_a_newer_version_asks_something_is_left_alone_and_a_person_is_told() {
+    let mut w = World::on(CORRIDOR).await;
+    w.submit("T1", "A", "B").await;
+    w.submit("T2", "A", "B").await;
+    w.pass(1).await;
+    let body = r#"{"id":"q1","ask":{"hold":{"task_id":"T1"}},"reason":"wait","actor":"anna","at_unix_ms":1}"#;
+    let write = Write::Put { index: Index::default(), body: body.into() };
+    let mut item = Item::new(Writer::Task, "tests");
+    let key = Key::new(Table::TaskRequest, "q1");
+    item.rows.push(RowChange { key, expect: Expect::Absent, write, kind: "task.hold_requested" });
+    w.store.commit(vec![item]).await.pop().expect("a result").expect("applied");
+    w.pass(1).await;
+    w.robot("r1", "park-a").await;
+    w.until_phase("T2", Phase::Succeeded).await;
+    assert_eq!(w.seen().await.phase("T1"), Phase::Queued);
+    assert_eq!(why(&w, "T1").await.0, "ROW_UNKNOWN");
+    assert_eq!(w.seen().await.open_incidents("ROW_UNKNOWN").len(), 1);
+}

@@ -111,7 +111,7 @@ async fn what_is_not_there_or_not_one_is_not_rotated_and_what_an_old_store_has_t
             name: "anna".to_owned(),
             person: None,
             digest: Digest([1; 32]),
-            grants: vec!["viewer".parse().expect("a grant")],
+            grants: vec!["viewer".to_owned().into()],
             created_unix_ms: 0,
             created_by: "bert".to_owned(),
             expires_unix_ms: i64::MAX,

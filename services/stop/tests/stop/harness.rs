@@ -51,7 +51,7 @@ fn known(mut request: Request<()>) -> Result<Request<()>, Status> {
         let caller = match name.strip_prefix("robot:") {
             Some(robot_id) => Caller::robot(RobotId::parse(robot_id).unwrap()),
             None => {
-                let grants = words.map(|grant| grant.parse().unwrap()).collect();
+                let grants = words.map(|grant| grant.to_owned().into()).collect();
                 Caller::holder(TokenId::new("t1").unwrap(), name.into(), grants, false)
             }
         };

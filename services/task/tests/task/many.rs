@@ -12,10 +12,11 @@ use midshift_proto::task::v1::{self, TaskState, submit_task_request::Body};
 use midshift_store::Store;
 
 fn cancel(states: &[TaskState], validate_only: bool) -> v1::CancelTasksRequest {
+    let all = states.is_empty();
     let states = states.iter().map(|state| *state as i32).collect();
     let filter = Some(v1::TaskFilter { states, ..v1::TaskFilter::default() });
     let (request_id, reason) = ("all-1".to_owned(), "shift is over".to_owned());
-    v1::CancelTasksRequest { filter, request_id, reason, validate_only, ..Default::default() }
+    v1::CancelTasksRequest { filter, request_id, reason, validate_only, all, ..Default::default() }
 }
 
 async fn outcome(world: &World, request: v1::CancelTasksRequest) -> v1::BulkOutcome {
@@ -55,6 +56,7 @@ async fn a_resolve_of_many_answers_only_those_that_wait_for_a_person() {
     let request = v1::ResolveTasksRequest {
         resolution: v1::Resolution::Requeue.into(),
         reason: "looked at".into(),
+        all: true,
         ..v1::ResolveTasksRequest::default()
     };
     let head = world.head();
@@ -66,6 +68,23 @@ async fn a_resolve_of_many_answers_only_those_that_wait_for_a_person() {
     for id in [&stuck, &queued] {
         assert_eq!(world.state(id).await.0.phase, Phase::Queued);
     }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_filter_that_says_nothing_does_not_mean_every_task() {
+    let world = World::new().await;
+    submit(&world.service, transport("r1", "B03")).await.expect("admitted");
+    let head = world.head();
+    for filter in [None, Some(v1::TaskFilter::default())] {
+        let request = v1::CancelTasksRequest { filter: filter.clone(), all: false, ..cancel(&[], false) };
+        let refused = world.service.cancel_tasks(local(request)).await.expect_err("nobody is named");
+        assert!(refused.message().contains("set all"), "{refused}");
+        let reason = "looked at".to_owned();
+        let resolution = v1::Resolution::Requeue.into();
+        let request = v1::ResolveTasksRequest { filter, resolution, reason, ..Default::default() };
+        world.service.resolve_tasks(local(request)).await.expect_err("nobody is named");
+    }
+    assert_eq!(world.head(), head, "nothing is written");
 }
 
 #[tokio::test(start_paused = true)]

@@ -41,7 +41,7 @@ pub fn asked<T>(by: &Caller, message: T) -> Request<T> {
 
 /// Anna, with these rights.
 pub fn anna(grants: &[&str]) -> Caller {
-    let grants = grants.iter().map(|grant| grant.parse().expect("a grant")).collect();
+    let grants = grants.iter().map(|grant| (*grant).to_owned().into()).collect();
     Caller::holder(TokenId::new("t1").expect("an id"), "anna".into(), grants, false)
 }
 

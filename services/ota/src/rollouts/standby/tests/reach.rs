@@ -13,7 +13,7 @@ fn asked<T>(by: &Caller, message: T) -> Request<T> {
 }
 
 fn holder(name: &str, grants: &[&str]) -> Caller {
-    let grants = grants.iter().map(|grant| grant.parse().expect("a grant")).collect();
+    let grants = grants.iter().map(|grant| (*grant).to_owned().into()).collect();
     Caller::holder(TokenId::new("t1").expect("an id"), name.into(), grants, false)
 }
 
