@@ -210,6 +210,30 @@ impl PostgresServer {
         String::from_utf8_lossy(&output.stdout).trim().to_owned()
     }
 
+    /// A whole database as SQL text, without what only this version of the server would understand.
+    ///
+    /// # Panics
+    /// If it cannot be read.
+    pub fn text(&self, url: &str) -> String {
+        let mut dump = self.command("pg_dump");
+        let output = dump.args(["--inserts", "--no-owner", "--no-privileges", "-d", url]).output().expect("pg_dump");
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let text = String::from_utf8(output.stdout).expect("text");
+        let own = ["--", "SET ", "SELECT pg_catalog.set_config", "\\"];
+        let lines = text.lines().filter(|line| !line.is_empty() && !own.iter().any(|begin| line.starts_with(begin)));
+        lines.map(|line| format!("{line}\n")).collect()
+    }
+
+    /// Runs such a text in an empty database, all of it or nothing.
+    ///
+    /// # Panics
+    /// If something of it is refused.
+    pub fn load(&self, url: &str, text: &Path) {
+        let file = std::fs::File::open(text).unwrap_or_else(|e| panic!("opening {}: {e}", text.display()));
+        let mut psql = self.command("psql");
+        run(psql.args(["-X", "-q", "-1", "-v", "ON_ERROR_STOP=1", "-d", url]).stdin(Stdio::from(file)));
+    }
+
     /// Number of the server's first process, the parent of all others.
     pub fn pid(&self) -> Option<u32> {
         let file = std::fs::read_to_string(self.dir.path().join("data/postmaster.pid")).ok()?;

@@ -13,6 +13,8 @@ mod logs;
 mod newer_words;
 #[path = "architecture/pages.rs"]
 mod pages;
+#[path = "architecture/released.rs"]
+mod released;
 #[path = "architecture/serde_types.rs"]
 mod serde_types;
 #[path = "architecture/source.rs"]
@@ -105,6 +107,9 @@ fn of_rooms(rooms: &[&str]) -> impl Iterator<Item = String> {
 
 /// Files that are still longer, below a folder, with how many of them there are. It only shrinks.
 const KNOWN_LONG: &[(&str, usize)] = &[("core/", 1), ("proto/", 2), ("tests/", 3)];
+
+/// What runs of releases left: nobody writes it and nobody cuts it.
+const RECORDED: &str = "tests/fixtures/";
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
@@ -355,7 +360,8 @@ fn a_service_names_no_writer_but_itself() {
 
 #[test]
 fn no_file_is_longer_than_a_person_reads() {
-    let all: Vec<String> = ["rs", "proto", "sql"].into_iter().flat_map(|ext| files(".", ext)).collect();
+    let all = ["rs", "proto", "sql"].into_iter().flat_map(|ext| files(".", ext));
+    let all: Vec<String> = all.filter(|path| !path.starts_with(RECORDED)).collect();
     assert!(all.len() > 100);
     let written = all.into_iter().filter(|path| !path.contains("/golden/"));
     let long = written.map(|p| (read(&p).lines().count(), p)).filter(|(lines, _)| *lines > LINES_MAX);

@@ -56,6 +56,8 @@ pub fn dist(workspace: &Workspace, options: &Options) -> Result<bool> {
     let version = workspace.version()?;
     let notes = std::fs::read_to_string(workspace.root.join("CHANGELOG.md")).context("reading CHANGELOG.md")?;
     ensure!(is_told(&notes, &version), "CHANGELOG.md has no heading \"## {version}\": say first what is in it");
+    let left = workspace.root.join("tests/fixtures").join(&version);
+    ensure!(left.is_dir(), "nobody has kept what a run of {version} leaves; next: cargo xtask fixtures record");
     let to = options.to.clone().unwrap_or_else(|| workspace.target.join(format!("release-{version}")));
     ensure!(!to.exists(), "{} is there already; remove it or name another folder by --to", to.display());
     let packages = PACKAGES.iter().flat_map(|package| ["-p", package]);

@@ -37,6 +37,7 @@ const HEAVY: &[(&str, usize)] = &[
     ("partition::", 2),
     ("played::", 2),
     ("public_address::", 2),
+    ("released::", 2),
     ("split::", 3),
     ("split_held::", 2),
     ("split_restored::", 2),
@@ -371,17 +372,25 @@ impl Times {
 /// Names of all tests as they stand in the sources, `module::name`, with the source of their modules.
 #[cfg(test)]
 pub fn in_sources() -> Vec<(String, String)> {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/tests/e2e");
     let mut names = Vec::new();
+    in_folder(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/tests/e2e"), "", &mut names);
+    names
+}
+
+#[cfg(test)]
+fn in_folder(folder: &Path, above: &str, names: &mut Vec<(String, String)>) {
     for entry in std::fs::read_dir(folder).expect("the suite").flatten() {
+        let module = format!("{above}{}", entry.path().file_stem().expect("a name").to_string_lossy());
+        if entry.path().is_dir() {
+            in_folder(&entry.path(), &format!("{module}::"), names);
+            continue;
+        }
         let text = std::fs::read_to_string(entry.path()).expect("a file");
-        let module = entry.path().file_stem().expect("a name").to_string_lossy().into_owned();
         for marked in text.split("#[test]").flat_map(|part| part.split("#[tokio::test")).skip(1) {
             let name = marked.split("fn ").nth(1).and_then(|rest| rest.split('(').next()).expect("a test has a name");
             names.push((format!("{module}::{name}"), marked.to_owned()));
         }
     }
-    names
 }
 
 #[cfg(test)]

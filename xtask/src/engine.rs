@@ -38,7 +38,8 @@ mod tests {
     use crate::e2e;
 
     /// What a test has in its name, or its module, that starts PostgreSQL whatever the engine.
-    const ALREADY: &[&str] = &["postgresql", "split::", "split_stack", "partition::", "while_the_database_"];
+    const ALREADY: &[&str] =
+        &["postgresql", "released::", "split::", "split_stack", "partition::", "while_the_database_"];
 
     #[test]
     fn what_runs_again_on_postgresql_is_there_and_did_not_run_there_before() {

@@ -12,6 +12,7 @@ mod docker;
 mod e2e;
 mod engine;
 mod fetch_tools;
+mod fixtures;
 mod go;
 mod images;
 mod parts;
@@ -62,6 +63,9 @@ enum Verb {
     /// The stack of a compose file as processes of this machine, without docker.
     #[command(subcommand)]
     Stack(stack::Verb),
+    /// What a run of this version leaves, for the tests of later versions.
+    #[command(subcommand)]
+    Fixtures(fixtures::Verb),
     /// Everything a release consists of: archives of programs and source, images, digests. Nothing is uploaded.
     Dist(dist::Options),
     /// Write the golden files anew from what the code does now. Read the diff before you commit it.
@@ -81,6 +85,7 @@ fn main() -> ExitCode {
             docker::test(&workspace, &stack::midshift(&workspace, binary)?)
         }
         Verb::Stack(verb) => stack::run(&workspace, verb),
+        Verb::Fixtures(verb) => fixtures::run(&workspace, verb),
         Verb::Dist(options) => dist::dist(&workspace, &options),
         Verb::Golden => sweep::golden(&workspace),
         Verb::Tidy => sweep::tidy(&workspace),

@@ -6,7 +6,7 @@
 use crate::round::{Count, Round, Scope};
 use crate::stack::{self, Which};
 use crate::workspace::Workspace;
-use crate::{clients, deny, dist, docker, e2e, engine, quick, run};
+use crate::{clients, deny, dist, docker, e2e, engine, fixtures, quick, run};
 use anyhow::Result;
 use clap::ValueEnum;
 
@@ -19,7 +19,7 @@ pub enum Part {
     Clippy,
     /// The documentation builds without a warning.
     Rustdoc,
-    /// The .proto files keep buf's STANDARD rules.
+    /// The .proto files keep buf's STANDARD rules, and break nothing that a release says.
     Buf,
     /// The programs build; tests get their paths.
     Build,
@@ -120,7 +120,8 @@ impl Part {
             Self::Buf => {
                 let Some(tools) = tools else { return Ok(false) };
                 let mut lint = workspace.command(&tools.buf);
-                run::succeeds(lint.arg("lint").current_dir(workspace.root.join("proto")))
+                Ok(run::succeeds(lint.arg("lint").current_dir(workspace.root.join("proto")))?
+                    && fixtures::breaks_nothing(workspace, tools)?)
             }
             Self::Build => build(workspace),
             Self::Clients => {

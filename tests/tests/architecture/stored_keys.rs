@@ -12,7 +12,8 @@ use midshift_core::reason::Code;
 use midshift_core::rows::Table;
 use std::collections::{BTreeMap, BTreeSet};
 
-const GOLDEN: &str = "tests/golden/stored_keys.txt";
+/// The list of all of them.
+pub const GOLDEN: &str = "tests/golden/stored_keys.txt";
 
 /// Types of the standard library and of others that are one text, number or flag.
 const PLAIN: [&str; 22] = [

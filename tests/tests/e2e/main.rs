@@ -50,6 +50,7 @@ mod partition;
 mod played;
 mod proxy;
 mod public_address;
+mod released;
 mod restored;
 mod rights;
 mod robots;

@@ -62,6 +62,20 @@ impl Robot {
     ) -> anyhow::Result<Command> {
         std::fs::create_dir_all(home)?;
         trust(samples, &text::parse(DEMO)?)?.write(&home.join("trust.json"))?;
+        Self::command_in(id, start, home, server, stops, enrolment)
+    }
+    /// Starts what lies in `home` again, at a server without login.
+    pub fn relaunch(id: &str, start: &str, home: &Path, server: &str) -> anyhow::Result<Self> {
+        Self::start(Self::command_in(id, start, home, server, None, None)?, home)
+    }
+    fn command_in(
+        id: &str,
+        start: &str,
+        home: &Path,
+        server: &str,
+        stops: Option<SocketAddr>,
+        enrolment: Option<&str>,
+    ) -> anyhow::Result<Command> {
         let (program, sets) = (midshift()?, home.join("sets"));
         let mut command = Command::new(&program);
         if let Some(secret) = enrolment {

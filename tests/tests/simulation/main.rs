@@ -11,6 +11,7 @@ mod clock;
 mod counted;
 mod directed;
 mod disk;
+mod frames;
 mod incidents;
 mod law_names;
 mod laws;

@@ -5,7 +5,8 @@
 //! for it. What a robot writes into its files is added to in robot_agent/tests/agent/successor.rs. Invariant: what this version would have said is said
 //! too, word for word. Called by the room and by its own tests.
 
-use hyper::body::{Body as HttpBody, Bytes, Frame, Incoming};
+use crate::frames::Frame;
+use hyper::body::{Body as HttpBody, Bytes, Frame as HttpFrame, Incoming};
 use hyper::header::CONTENT_LENGTH;
 use hyper::server::conn::http2;
 use hyper::service::service_fn;
@@ -78,6 +79,8 @@ struct State {
     bundle: Option<String>,
     is_hasty: bool,
     said: BTreeMap<(Speaker, String), u64>,
+    /// Once frames are kept: the first of each kind that this version says, by what it is made of.
+    frames: Option<BTreeMap<BTreeSet<String>, Frame>>,
 }
 
 impl Newer {
@@ -113,6 +116,14 @@ impl Newer {
     /// The same of all messages and words.
     pub fn said_by(&self, speaker: Speaker) -> u64 {
         self.state().said.iter().filter(|((by, _), _)| *by == speaker).map(|(_, times)| times).sum()
+    }
+    /// From now on the first frame of each kind that this version says is kept.
+    pub fn keep_frames(&self) {
+        self.state().frames = Some(BTreeMap::new());
+    }
+    /// Those that were kept.
+    pub fn frames(&self) -> Vec<Frame> {
+        self.state().frames.iter().flat_map(|frames| frames.values().cloned()).collect()
     }
     /// What a server's disk is given.
     pub fn writes(&self, mut items: Vec<Item>) -> Vec<Item> {
@@ -271,6 +282,10 @@ impl Voice {
             Speaker::Server => state.server,
         };
         if version == Version::This {
+            if let Some(frames) = &mut state.frames {
+                let frame = Frame { message: kind.full_name().to_owned(), bytes: said.to_vec() };
+                frames.entry(frame.parts()).or_insert(frame);
+            }
             return said.to_vec();
         }
         let mut message = DynamicMessage::decode(kind.clone(), said).expect("what a program says can be read");
@@ -324,7 +339,7 @@ impl HttpBody for Told {
     fn poll_frame(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Self::Data>, Self::Error>>> {
+    ) -> Poll<Option<Result<HttpFrame<Self::Data>, Self::Error>>> {
         loop {
             let frame = match ready!(Pin::new(&mut self.inner).poll_frame(cx)) {
                 Some(Ok(frame)) => frame,
@@ -337,7 +352,7 @@ impl HttpBody for Told {
             self.held.extend_from_slice(&data);
             let whole = self.whole();
             if !whole.is_empty() {
-                return Poll::Ready(Some(Ok(Frame::data(whole))));
+                return Poll::Ready(Some(Ok(HttpFrame::data(whole))));
             }
         }
     }

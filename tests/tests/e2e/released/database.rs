@@ -1,0 +1,92 @@
+//! What a run left as text, and back: every database as SQL, all other files as they are.
+
+use super::run::{Left, ROBOTS};
+use crate::harness::tool;
+use anyhow::{Context, ensure};
+use midshift_tests::postgres::PostgresServer;
+use std::fs;
+use std::io::Write;
+use std::os::unix::fs::DirBuilderExt;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+/// A database of SQLite as SQL text, and back; the version that its owner gave it goes with it.
+const SQLITE: &str = r#"
+import sqlite3, sys
+verb, path = sys.argv[1:]
+file = sqlite3.connect(path)
+if verb == "dump":
+    print(f"PRAGMA user_version={file.execute('PRAGMA user_version').fetchone()[0]};")
+    for line in file.iterdump():
+        print(line)
+else:
+    file.executescript(sys.stdin.read())
+"#;
+/// The text of a store of PostgreSQL, beside the data directory.
+const STORE: &str = "store.sql";
+/// Ends of the names of what each start makes anew.
+const MADE_ANEW: [&str; 5] = ["log", ".lock", "-wal", "-shm", ".sock"];
+
+/// Writes down what is left of a run.
+pub fn write(left: &Left, to: &Path) -> anyhow::Result<()> {
+    copy(&left.dir.path().join("data"), &to.join("data"))?;
+    for (id, _) in ROBOTS {
+        copy(&left.dir.path().join(id), &to.join(id))?;
+    }
+    left.database.iter().try_for_each(|url| Ok(fs::write(to.join(STORE), PostgresServer::shared().text(url))?))
+}
+
+/// Makes `dir/data` and the robots' folders of what was written down; the URL of the database, if the store has one.
+pub fn restore(from: &Path, dir: &Path) -> anyhow::Result<Option<String>> {
+    copy(&from.join("data"), &dir.join("data"))?;
+    for (id, _) in ROBOTS {
+        copy(&from.join(id), &dir.join(id))?;
+    }
+    let store = from.join(STORE);
+    if !store.exists() {
+        return Ok(None);
+    }
+    let server = PostgresServer::shared();
+    let url = server.database();
+    server.load(&url, &store);
+    Ok(Some(url))
+}
+
+/// Copies a folder, for its owner alone as `serve` wants it; databases become text, and texts databases.
+fn copy(from: &Path, to: &Path) -> anyhow::Result<()> {
+    fs::DirBuilder::new().recursive(true).mode(0o700).create(to)?;
+    for entry in fs::read_dir(from).with_context(|| format!("reading {}", from.display()))? {
+        let path = entry?.path();
+        let name = path.file_name().context("a name")?.to_string_lossy().into_owned();
+        match name.rsplit_once('.') {
+            _ if path.is_dir() => copy(&path, &to.join(&name))?,
+            Some((name, "db")) => fs::write(to.join(format!("{name}.sql")), sqlite_text(&path)?)?,
+            Some((name, "sql")) => sqlite_file(&path, &to.join(format!("{name}.db")))?,
+            _ if MADE_ANEW.iter().any(|end| name.ends_with(end)) => {}
+            _ => drop(fs::copy(&path, to.join(&name)).with_context(|| format!("copying {}", path.display()))?),
+        }
+    }
+    Ok(())
+}
+
+fn python(verb: &str, file: &Path) -> anyhow::Result<Command> {
+    let mut command = Command::new(tool("MIDSHIFT_TEST_PYTHON")?);
+    command.args(["-c", SQLITE, verb]).arg(file);
+    Ok(command)
+}
+
+/// A database of SQLite as text.
+pub fn sqlite_text(file: &Path) -> anyhow::Result<String> {
+    ensure!(file.is_file(), "there is no {}", file.display());
+    let output = python("dump", file)?.output()?;
+    ensure!(output.status.success(), "{}: {}", file.display(), String::from_utf8_lossy(&output.stderr));
+    Ok(String::from_utf8(output.stdout)?)
+}
+
+fn sqlite_file(text: &Path, file: &Path) -> anyhow::Result<()> {
+    let mut child = python("load", file)?.stdin(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
+    child.stdin.take().context("stdin was piped")?.write_all(&fs::read(text)?)?;
+    let output = child.wait_with_output()?;
+    ensure!(output.status.success(), "{}: {}", file.display(), String::from_utf8_lossy(&output.stderr));
+    Ok(())
+}
