@@ -47,8 +47,8 @@ mod tests {
     #[test]
     fn an_explanation_names_what_is_waited_for_where_something_is() {
         let mut reason =
-            Reason { code: "PLACE_BLOCKED".into(), message: "waits for a place".into(), ..Reason::default() };
-        assert_eq!(verdict(Some(&reason), "-"), "\n  PLACE_BLOCKED: waits for a place\n");
+            Reason { code: "PLACE_OCCUPIED".into(), message: "waits for a place".into(), ..Reason::default() };
+        assert_eq!(verdict(Some(&reason), "-"), "\n  PLACE_OCCUPIED: waits for a place\n");
         reason.metadata.insert(WAITS_FOR.into(), "door: held by r1".into());
         assert!(verdict(Some(&reason), "-").ends_with("\n  waits for door: held by r1\n"));
         assert_eq!(verdict(None, "nothing holds it"), "\n  nothing holds it\n");

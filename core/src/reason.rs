@@ -214,7 +214,7 @@ mod tests {
 
     #[test]
     fn every_reason_behind_a_closed_place_names_what_opens_it() {
-        for code in [Code::PlaceBlocked, Code::PlaceQuarantined, Code::UncertainTooLong, Code::RobotDroppedIt] {
+        for code in [Code::PlaceOccupied, Code::PlaceQuarantined, Code::UncertainTooLong, Code::RobotDroppedIt] {
             assert!(code.next_step().contains("midshift zone clear PLACE"), "{code}");
         }
     }

@@ -206,7 +206,7 @@ codes! {
     WorkUnreadable = "WORK_UNREADABLE", "The robot cannot read the work that it was sent and acts as if its authority had ended. Its software is too old for this server, or the other way round.";
     AssignmentUnlawful = "ASSIGNMENT_UNLAWFUL", "The record of the task names a step that it does not have, so the robot was not sent it. A person must resolve the task.";
     RouteTooLong = "ROUTE_TOO_LONG", "The way through all goals of the task has more points than a robot takes. Split the task.";
-    PlaceBlocked = "PLACE_BLOCKED", "A place on the way is held by another robot, or closed because nobody knows what a robot does there."
+    PlaceOccupied = "PLACE_OCCUPIED", "A place on the way is held by another robot, or closed because nobody knows what a robot does there."
         => "`midshift zone ls --in-use` shows who holds it. If it is closed, look there, then `midshift zone clear PLACE --reason TEXT --if-match ETAG`.";
     ExcludedAfterFailure = "EXCLUDED_AFTER_FAILURE", "The robot failed this task and the task asks for another.";
     BoundElsewhere = "BOUND_ELSEWHERE", "The task is opened: its item is on another robot.";

@@ -164,7 +164,7 @@ fn place(view: &FleetProjection, here: WaypointIx, goals: &[WaypointIx]) -> Resu
     let mut at = here;
     for goal in goals {
         if view.router.field_around(*goal, closed).distance_mm(at).is_none() {
-            return Err(Reason::from(Code::PlaceBlocked).with("goal", view.site.name_of(*goal)));
+            return Err(Reason::from(Code::PlaceOccupied).with("goal", view.site.name_of(*goal)));
         }
         at = *goal;
     }

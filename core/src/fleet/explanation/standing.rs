@@ -276,7 +276,7 @@ pub fn of_robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &Rob
 /// there, a stop, whoever came first, an area that is full, or a free seat that others go to first. None: it waits for none.
 pub fn place_wait(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> {
     let wait = view.waits.get(robot_id)?;
-    let mut reason = Reason::from(Code::PlaceBlocked);
+    let mut reason = Reason::from(Code::PlaceOccupied);
     for (key, told, who) in in_the_way(view, robot_id, &wait.places) {
         if who.is_empty() {
             continue;

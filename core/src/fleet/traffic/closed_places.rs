@@ -104,7 +104,7 @@ impl ClosedPlace {
 
 /// A way that a closed place bars, with that place; another reason stays as it is.
 pub fn name_closed(view: &FleetProjection, reason: Reason) -> Reason {
-    if reason.code != Code::PlaceBlocked || !reason.message.is_empty() {
+    if reason.code != Code::PlaceOccupied || !reason.message.is_empty() {
         return reason;
     }
     let goal = reason.metadata.get("goal").and_then(|goal| WaypointId::parse(goal).ok());

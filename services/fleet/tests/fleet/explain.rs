@@ -224,7 +224,7 @@ async fn a_robot_that_waits_for_a_place_names_its_holder() {
     w.until("r2 is in A", |s| s.holders("A") == [("r2".to_owned(), HolderState::Inside)]).await;
     w.pass(15).await;
     let (code, waits_for) = of_both(&w, "T2", "r2").await;
-    assert_eq!(code, "PLACE_BLOCKED");
+    assert_eq!(code, "PLACE_OCCUPIED");
     assert!(waits_for.contains("B") && waits_for.contains("r1"), "{waits_for}");
 }
 
@@ -261,7 +261,7 @@ async fn a_closed_place_is_the_goal_and_the_task_goes_on_when_it_opens() {
     w.robot("r1", "park-b").await;
     w.submit("T2", "A", "B").await;
     w.pass_while(60, "it is given to nobody", |s| s.phase("T2") == Phase::Queued).await;
-    assert_eq!(why(&w, "T2").await, codes(Code::WaitingForRobot, "PLACE_BLOCKED"));
+    assert_eq!(why(&w, "T2").await, codes(Code::WaitingForRobot, "PLACE_OCCUPIED"));
     w.r("r2").mend();
     w.connect("r2").await;
     w.until_phase("T2", Phase::Succeeded).await;
@@ -282,7 +282,7 @@ async fn who_has_no_work_but_at_a_closed_place_is_told_by_whom_since_when_and_wh
     w.submit("T2", "A", "B").await;
     w.pass(10).await;
     let robot = of_robot(&w, "r1").await;
-    assert_eq!((robot.code.as_str(), robot.metadata["robots"].as_str()), ("PLACE_BLOCKED", "r2"));
+    assert_eq!((robot.code.as_str(), robot.metadata["robots"].as_str()), ("PLACE_OCCUPIED", "r2"));
     for told in [robot, of_task(&w, "T2").await] {
         let words = ["Place A", "r2", since.as_str(), "`midshift zone clear A --reason TEXT --if-match ETAG`"];
         assert!(words.iter().all(|word| told.message.contains(word)), "{told:?}");

@@ -47,7 +47,7 @@ async fn a_robot_waits_for_a_place_that_is_kept_for_another_and_explain_says_for
     w.pass_while(100, "the charger is not given", |s| s.holders("charge").is_empty()).await;
     let told = w.fleet.explain_task(local(v1::ExplainTaskRequest { task_id: "T1".to_owned() })).await;
     let verdict = told.expect("an explanation").into_inner().explanation.and_then(|e| e.verdict).expect("a verdict");
-    assert_eq!(verdict.code, Code::PlaceBlocked.as_str());
+    assert_eq!(verdict.code, Code::PlaceOccupied.as_str());
     assert_eq!(verdict.metadata.get("kept_for").map(String::as_str), Some("r2"), "{verdict:?}");
     w.robot("r2", "charge").await;
     w.pass(5).await;

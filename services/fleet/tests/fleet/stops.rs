@@ -171,7 +171,7 @@ async fn work_beyond_a_stopped_zone_waits_for_its_reset() {
     w.stop(&zone).await;
     w.submit("T1", "A", "B").await;
     w.pass_while(60, "no way leads to B", |s| s.phase("T1") == Phase::Queued).await;
-    assert_eq!(why(&w, "T1").await.1, Code::PlaceBlocked.as_str());
+    assert_eq!(why(&w, "T1").await.1, Code::PlaceOccupied.as_str());
     w.stop(&reset(zone)).await;
     w.until_phase("T1", Phase::Succeeded).await;
     w.lawful().await;
