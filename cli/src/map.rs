@@ -32,7 +32,7 @@ pub fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             let site = site_file::load(file.as_deref(), None, None)?.site;
             match out.format {
                 Format::Json | Format::Jsonl => {
-                    let places: Vec<_> = site.places().iter().map(|p| serde_json::json!({"placeId": p.place_id, "kind": p.kind_str(), "capacity": p.capacity})).collect();
+                    let places: Vec<_> = site.places().iter().map(|p| serde_json::json!({"placeId": p.place_id, "kind": p.kind_str(), "rule": p.rule_str(), "capacity": p.capacity})).collect();
                     let waypoints: Vec<_> = site
                         .waypoints()
                         .iter()

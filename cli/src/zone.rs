@@ -79,7 +79,8 @@ fn kept(place: &v1::Place, robot_id: &str) -> String {
 }
 
 impl Listed for v1::Place {
-    const HEADER: &'static [&'static str] = &["PLACE", "KIND", "SEATS", "HELD BY", "WAITING", "QUARANTINE", "ETAG"];
+    const HEADER: &'static [&'static str] =
+        &["PLACE", "KIND", "RULE", "SEATS", "HELD BY", "WAITING", "QUARANTINE", "ETAG"];
     fn name(&self) -> String {
         self.place_id.clone()
     }
@@ -92,6 +93,7 @@ impl Listed for v1::Place {
         vec![
             self.place_id.clone(),
             self.kind().as_str_name().trim_start_matches("PLACE_KIND_").to_owned(),
+            self.rule().as_str_name().trim_start_matches("PLACE_RULE_").to_owned(),
             self.capacity.to_string(),
             self.holders.iter().map(holder).chain(awaited).collect::<Vec<_>>().join(", "),
             self.waiting_robot_ids.join(", "),

@@ -129,8 +129,8 @@ fn clear(tx: &mut Tx, board: &Board, place: Place) {
         kept.iter().any(|holder| robot_id.is_some_and(|id| *id == holder.robot_id.as_str()))
     };
     let quarantine = place.quarantine.filter(is_of_kept);
-    let (place_id, capacity, standing) = (place.place_id, place.capacity, place.standing);
-    tx.put_row(Place { place_id, capacity, standing, holders: kept, quarantine, cleared }, "place.cleared");
+    let (place_id, capacity, kind) = (place.place_id, place.capacity, place.kind);
+    tx.put_row(Place { place_id, capacity, kind, holders: kept, quarantine, cleared }, "place.cleared");
 }
 
 /// What people may say of a robot is what it may say of itself.

@@ -91,11 +91,8 @@ pub fn found(view: &mut FleetProjection, now: Now, site_text: &str, map: &maps::
                 }
                 let known = tx.view.places.get(place.place_id.as_str()).map(|p| p.row.clone());
                 let fresh = Place::unheld(place);
-                let row = known.map_or(fresh.clone(), |k| rows::Place {
-                    capacity: fresh.capacity,
-                    standing: fresh.standing,
-                    ..k
-                });
+                let row =
+                    known.map_or(fresh.clone(), |k| rows::Place { capacity: fresh.capacity, kind: fresh.kind, ..k });
                 tx.put_row(row, "place.founded");
             }
         });
@@ -106,10 +103,9 @@ pub fn found(view: &mut FleetProjection, now: Now, site_text: &str, map: &maps::
 }
 
 fn site_has(view: &FleetProjection, place: &crate::site::Place) -> bool {
-    let standing = place.waypoint().is_some();
     view.places
         .get(place.place_id.as_str())
-        .is_some_and(|p| p.row.capacity == place.capacity && p.row.standing == standing)
+        .is_some_and(|p| p.row.capacity == place.capacity && p.row.kind == place.kind())
 }
 
 /// How much of a cycle is due.

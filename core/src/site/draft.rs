@@ -1,8 +1,8 @@
 //! The only way into a [`Site`]: names and numbers as read, checked all together. Called by the text format and the imports.
 
 use super::map::{
-    Area, AreaDefaults, AreaIx, Inside, Kind, Lane, LaneIx, Place, PlaceIx, PlaceKind, Site, Source, Waypoint,
-    WaypointIx,
+    Area, AreaDefaults, AreaIx, Inside, Kind, Lane, LaneIx, Place, PlaceExtent, PlaceIx, PlaceRule, Site, Source,
+    Waypoint, WaypointIx,
 };
 use crate::ids::{AreaId, PlaceId, RobotId, SiteId, WaypointId};
 use crate::limits::{
@@ -293,11 +293,11 @@ fn build_passages(v: &mut Violations, drafts: Vec<DraftPassage>, names: &Names, 
             v.add(field, "a passage needs lanes, or waypoints with lanes, inside");
         }
         let inside = Inside { lanes: inside.into_iter().collect(), waypoints: inner.into_iter().collect() };
-        let (kind, capacity) = match draft.capacity {
-            None => (PlaceKind::Exclusive(inside), 1),
-            Some(n) => (PlaceKind::Capacity(inside), n),
+        let (rule, capacity) = match draft.capacity {
+            None => (PlaceRule::Exclusive, 1),
+            Some(n) => (PlaceRule::Capacity, n),
         };
-        places.push(Place { place_id, kind, capacity });
+        places.push(Place { place_id, extent: PlaceExtent::Passage(inside), rule, capacity });
     }
     places
 }
@@ -308,8 +308,9 @@ fn add_standing_places(v: &mut Violations, site: &mut Site, capacities: &[u32]) 
         let name = site.waypoints[at].waypoint_id.as_str();
         let Some(place_id) = v.accept("waypoint.id", PlaceId::parse(name)) else { continue };
         site.waypoints[at].standing = Some(PlaceIx(site.places.len() as u32));
-        let kind = PlaceKind::Standing(WaypointIx(at as u32));
-        site.places.push(Place { place_id, kind, capacity: *capacity });
+        let extent = PlaceExtent::Standing(WaypointIx(at as u32));
+        let rule = if *capacity == 1 { PlaceRule::Exclusive } else { PlaceRule::Capacity };
+        site.places.push(Place { place_id, extent, rule, capacity: *capacity });
     }
     for (at, place) in site.places.iter().enumerate() {
         if site.place_names.insert(place.place_id.clone(), PlaceIx(at as u32)).is_some() {

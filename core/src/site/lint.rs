@@ -3,7 +3,7 @@
 //! Invariant: a finding is of severity [`Severity::Error`] only for an authored site, which is refused then; imports are
 //! only warned about. Called by `map lint`, and by `serve` before it serves a site.
 
-use super::{Area, AreaIx, Kind, Lane, Place, PlaceKind, Site, Source, WaypointIx};
+use super::{Area, AreaIx, Kind, Lane, Place, PlaceRule, Site, Source, WaypointIx};
 use crate::limits;
 use serde::Serialize;
 use std::collections::BTreeSet;
@@ -231,7 +231,7 @@ fn cuts(report: &mut Report<'_>) {
 }
 
 fn is_exclusive(place: &Place) -> bool {
-    matches!(place.kind, PlaceKind::Exclusive(_)) || place.capacity == 1
+    place.rule == PlaceRule::Exclusive || place.capacity == 1
 }
 
 /// The opposite of a lane where both share one width.

@@ -94,14 +94,31 @@ pub struct Lane {
     pub passages: Box<[PlaceIx]>,
 }
 
-/// What kind of place.
-#[derive(Clone, Debug, PartialEq, Eq)]
+/// What a place is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum PlaceKind {
-    /// Driven through: one robot at a time.
-    Exclusive(Inside),
-    /// Driven through: up to the place's capacity at a time.
-    Capacity(Inside),
+    /// Driven through.
+    Passage,
     /// Stood on: reserved before a route is released to it.
+    Standing,
+}
+
+/// How many robots a place admits at once.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PlaceRule {
+    /// One.
+    Exclusive,
+    /// As many as its capacity says.
+    Capacity,
+}
+
+/// The floor that a place covers.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum PlaceExtent {
+    /// Of a passage.
+    Passage(Inside),
+    /// Of a standing place.
     Standing(WaypointIx),
 }
 
@@ -120,33 +137,48 @@ pub struct Inside {
 pub struct Place {
     /// Its name, unique in the site; a standing place is called like its waypoint.
     pub place_id: PlaceId,
-    /// Passage or standing.
-    pub kind: PlaceKind,
-    /// Robots at a time; at least 1, and 1 for [`PlaceKind::Exclusive`].
+    /// Its lanes and waypoints, which say what it is for.
+    pub extent: PlaceExtent,
+    /// By the site file: a standing place of capacity 1 is exclusive.
+    pub rule: PlaceRule,
+    /// Robots at a time; at least 1, and 1 for [`PlaceRule::Exclusive`].
     pub capacity: u32,
 }
 
 impl Place {
     /// The waypoint of a standing place.
     pub fn waypoint(&self) -> Option<WaypointIx> {
-        match self.kind {
-            PlaceKind::Standing(at) => Some(at),
-            PlaceKind::Exclusive(_) | PlaceKind::Capacity(_) => None,
+        match self.extent {
+            PlaceExtent::Standing(at) => Some(at),
+            PlaceExtent::Passage(_) => None,
         }
     }
     /// What lies inside, if it is a passage.
     pub fn inside(&self) -> Option<&Inside> {
-        match &self.kind {
-            PlaceKind::Exclusive(inside) | PlaceKind::Capacity(inside) => Some(inside),
-            PlaceKind::Standing(_) => None,
+        match &self.extent {
+            PlaceExtent::Passage(inside) => Some(inside),
+            PlaceExtent::Standing(_) => None,
         }
     }
-    /// EXCLUSIVE, CAPACITY or STANDING.
+    /// What it is for.
+    pub const fn kind(&self) -> PlaceKind {
+        match self.extent {
+            PlaceExtent::Passage(_) => PlaceKind::Passage,
+            PlaceExtent::Standing(_) => PlaceKind::Standing,
+        }
+    }
+    /// PASSAGE or STANDING.
     pub const fn kind_str(&self) -> &'static str {
-        match self.kind {
-            PlaceKind::Exclusive(_) => "EXCLUSIVE",
-            PlaceKind::Capacity(_) => "CAPACITY",
-            PlaceKind::Standing(_) => "STANDING",
+        match self.kind() {
+            PlaceKind::Passage => "PASSAGE",
+            PlaceKind::Standing => "STANDING",
+        }
+    }
+    /// EXCLUSIVE or CAPACITY.
+    pub const fn rule_str(&self) -> &'static str {
+        match self.rule {
+            PlaceRule::Exclusive => "EXCLUSIVE",
+            PlaceRule::Capacity => "CAPACITY",
         }
     }
 }

@@ -17,8 +17,8 @@ pub mod task_list;
 pub mod text;
 
 pub use map::{
-    Area, AreaDefaults, AreaIx, Inside, Kind, Lane, LaneIx, Place, PlaceIx, PlaceKind, Site, Source, Waypoint,
-    WaypointIx,
+    Area, AreaDefaults, AreaIx, Inside, Kind, Lane, LaneIx, Place, PlaceExtent, PlaceIx, PlaceKind, PlaceRule, Site,
+    Source, Waypoint, WaypointIx,
 };
 
 use crate::reason::Refusal;

@@ -42,7 +42,7 @@ fn describe(site: &Site, out: &mut String) -> std::fmt::Result {
         let people = if area.people { "yes" } else { "no" };
         writeln!(out, "{:<16} {seats:>6} {speed:>12} {distance:>14}  {people}", area.area_id.as_str())?;
     }
-    writeln!(out, "\n{:<16} {:<10} {:>8}  AT", "PLACE", "KIND", "CAPACITY")?;
+    writeln!(out, "\n{:<16} {:<9} {:<10} {:>8}  AT", "PLACE", "KIND", "RULE", "CAPACITY")?;
     for place in site.places() {
         let name = |w| site.name_of(w).as_str();
         let at = match (place.waypoint(), place.inside()) {
@@ -53,7 +53,8 @@ fn describe(site: &Site, out: &mut String) -> std::fmt::Result {
             }
             (None, None) => String::new(),
         };
-        writeln!(out, "{:<16} {:<10} {:>8}  {at}", place.place_id.as_str(), place.kind_str(), place.capacity)?;
+        let (place_id, kind, rule) = (place.place_id.as_str(), place.kind_str(), place.rule_str());
+        writeln!(out, "{place_id:<16} {kind:<9} {rule:<10} {:>8}  {at}", place.capacity)?;
     }
     Ok(())
 }

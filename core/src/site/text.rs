@@ -5,7 +5,7 @@
 //! What may stand in a file is told in docs/sites.md, whose example is read here.
 
 use super::draft::{Draft, DraftArea, DraftLane, DraftPassage, DraftRobot, DraftWaypoint};
-use super::map::{Area, AreaDefaults, Kind, Lane, Place, PlaceKind, Site, Source, Waypoint};
+use super::map::{Area, AreaDefaults, Kind, Lane, Place, PlaceRule, Site, Source, Waypoint};
 use crate::limits::SITE_FILE_BYTES;
 use crate::reason::{Refusal, Violations};
 use serde::Deserialize;
@@ -300,9 +300,9 @@ fn write_waypoint(site: &Site, w: &Waypoint, out: &mut String) -> std::fmt::Resu
 fn write_passage(site: &Site, place: &Place, out: &mut String) -> std::fmt::Result {
     let Some(inside) = place.inside() else { return Ok(()) };
     write!(out, "  {{ id = {}, ", quoted(place.place_id.as_str()))?;
-    match place.kind {
-        PlaceKind::Capacity(_) => write!(out, "rule = \"capacity\", capacity = {}", place.capacity)?,
-        PlaceKind::Exclusive(_) | PlaceKind::Standing(_) => write!(out, "rule = \"exclusive\"")?,
+    match place.rule {
+        PlaceRule::Capacity => write!(out, "rule = \"capacity\", capacity = {}", place.capacity)?,
+        PlaceRule::Exclusive => write!(out, "rule = \"exclusive\"")?,
     }
     let name = |at| quoted(site.name_of(at).as_str());
     let lanes = inside.lanes.iter().map(|l| site.lane(*l));

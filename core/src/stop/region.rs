@@ -6,7 +6,7 @@
 use crate::ids::{AreaId, PlaceId};
 use crate::limits;
 use crate::robot::Pose;
-use crate::site::{AreaIx, PlaceKind, Site, WaypointIx};
+use crate::site::{AreaIx, PlaceExtent, Site, WaypointIx};
 use serde::{Deserialize, Serialize};
 
 /// A box, millimetres in the site's frame, corners included.
@@ -63,9 +63,9 @@ impl Region {
 
     /// One passage or standing place of a site. None if the site has no such place.
     pub fn of_zone(site: &Site, place_id: &PlaceId) -> Option<Self> {
-        Some(match &site.place(site.find_place(place_id)?).kind {
-            PlaceKind::Standing(at) => Self::new([between(site, *at, *at)]),
-            PlaceKind::Exclusive(inside) | PlaceKind::Capacity(inside) => {
+        Some(match &site.place(site.find_place(place_id)?).extent {
+            PlaceExtent::Standing(at) => Self::new([between(site, *at, *at)]),
+            PlaceExtent::Passage(inside) => {
                 let lanes = inside.lanes.iter().map(|lane| site.lane(*lane));
                 Self::new(lanes.map(|lane| between(site, lane.from, lane.to)))
             }

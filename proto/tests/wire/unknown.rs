@@ -36,6 +36,7 @@ const FATES: &[(&str, Fate)] = &[
     ("fleet.v1.Errand", Fate::Shown),
     ("fleet.v1.PlaceHolderState", Fate::Shown),
     ("fleet.v1.PlaceKind", Fate::Shown),
+    ("fleet.v1.PlaceRule", Fate::Shown),
     ("link.v1.CloseCode", Fate::NotTaken),
     ("link.v1.HardwareStop", Fate::NotTaken),
     ("link.v1.Lane", Fate::NotTaken),

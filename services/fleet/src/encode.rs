@@ -9,7 +9,7 @@ use midshift_core::fleet::{Board, load, starts};
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::Duty;
 use midshift_core::rows::Revision;
-use midshift_core::site::PlaceKind;
+use midshift_core::site::{PlaceKind, PlaceRule};
 use midshift_core::task::state::Errand;
 use midshift_core::time::{Now, Utc};
 use midshift_proto::convert::WireEnum;
@@ -105,12 +105,14 @@ pub fn incident(row: &Incident, revision: Revision) -> v1::Incident {
 /// A place with its holders and who waits for it.
 pub fn place(view: &FleetProjection, row: &Place, revision: Revision) -> v1::Place {
     let site = view.site.find_place(&row.place_id).map(|ix| view.site.place(ix));
-    let kind = match site.map(|p| &p.kind) {
-        Some(PlaceKind::Exclusive(_)) => v1::PlaceKind::Exclusive,
-        Some(PlaceKind::Capacity(_)) => v1::PlaceKind::Capacity,
-        Some(PlaceKind::Standing(_)) => v1::PlaceKind::Standing,
-        None => v1::PlaceKind::Unspecified,
-    };
+    let kind = site.map_or(v1::PlaceKind::Unspecified, |p| match p.kind() {
+        PlaceKind::Passage => v1::PlaceKind::Passage,
+        PlaceKind::Standing => v1::PlaceKind::Standing,
+    });
+    let rule = site.map_or(v1::PlaceRule::Unspecified, |p| match p.rule {
+        PlaceRule::Exclusive => v1::PlaceRule::Exclusive,
+        PlaceRule::Capacity => v1::PlaceRule::Capacity,
+    });
     let mut waiting: Vec<_> = view
         .waits
         .iter()
@@ -124,6 +126,7 @@ pub fn place(view: &FleetProjection, row: &Place, revision: Revision) -> v1::Pla
     v1::Place {
         place_id: row.place_id.to_string(),
         kind: kind as i32,
+        rule: rule as i32,
         capacity: row.capacity,
         holders: row
             .holders

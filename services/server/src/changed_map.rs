@@ -81,7 +81,7 @@ mod tests {
     use midshift_core::fleet::rows::{HolderState, Place, PlaceHolder};
     use midshift_core::ids::{PlaceId, RobotId};
     use midshift_core::rows::{Item, Writer};
-    use midshift_core::site::{CORRIDOR, text};
+    use midshift_core::site::{CORRIDOR, PlaceKind, text};
     use midshift_core::time::{Clock, ScaledClock, Utc};
     use midshift_store::{MemoryStore, StoreId};
 
@@ -101,7 +101,7 @@ mod tests {
         let place = Place {
             place_id,
             capacity: 1,
-            standing: true,
+            kind: PlaceKind::Standing,
             holders: vec![holder],
             quarantine: None,
             cleared: Vec::new(),

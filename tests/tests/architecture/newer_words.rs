@@ -26,6 +26,7 @@ const WORDS: &[(&str, &[&str])] = &[
             "Outcome",
             "Pause",
             "Phase",
+            "PlaceKind",
             "PlaceNews",
             "Presence",
             "ReleasedBy",

@@ -5,6 +5,7 @@ use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, RolloutId, SiteId
 use crate::reason::Reason;
 use crate::robot::{Duty, Inventory};
 use crate::rows::{Index, Record, Seq, Table, body_is_json};
+use crate::site::PlaceKind;
 use crate::time::Utc;
 use crate::work::WorkStats;
 use serde::{Deserialize, Serialize};
@@ -45,8 +46,8 @@ pub struct Place {
     pub place_id: PlaceId,
     /// Robots admitted at once.
     pub capacity: u32,
-    /// Robots may stand in it.
-    pub standing: bool,
+    /// What the site file says that it is for.
+    pub kind: PlaceKind,
     /// Who has it.
     pub holders: Vec<PlaceHolder>,
     /// Set: nobody enters until the robot inside reports or a person clears it.
@@ -62,7 +63,7 @@ impl Place {
         Self {
             place_id: place.place_id.clone(),
             capacity: place.capacity,
-            standing: place.waypoint().is_some(),
+            kind: place.kind(),
             holders: Vec::new(),
             quarantine: None,
             cleared: Vec::new(),

@@ -5,13 +5,13 @@
 
 use super::routing;
 use crate::fleet::projection::liveness::{self, Board};
-use crate::fleet::projection::rows::HolderState;
+use crate::fleet::projection::rows::{HolderState, Place, PlaceHolder};
 use crate::fleet::projection::state::{self, FleetProjection};
 use crate::fleet::tasks::plausible;
 use crate::ids::{PlaceId, RobotId};
 use crate::robot::Presence;
-use crate::site::PlaceIx;
 use crate::site::route::{Segment, segments};
+use crate::site::{PlaceIx, PlaceKind};
 use crate::task::spec::Class;
 use crate::task::{Attempt, AttemptPhase};
 use crate::time::{Now, SiteTime};
@@ -60,7 +60,7 @@ pub fn waits(view: &FleetProjection, robot_id: &RobotId) -> bool {
 pub(super) fn bars_passage(view: &FleetProjection, robot_id: &RobotId) -> bool {
     let mut inside = false;
     for (place, holder) in state::held(view, robot_id) {
-        if place.standing {
+        if place.kind == PlaceKind::Standing {
             return false;
         }
         inside |= holder.state == HolderState::Inside;
@@ -123,7 +123,10 @@ pub(super) fn next_segment(
     {
         return None;
     }
-    let unentered = state::held(view, robot_id).filter(|(p, h)| p.standing && h.state == HolderState::Granted).count();
+    let is_unentered = |(place, holder): &(&Place, &PlaceHolder)| {
+        place.kind == PlaceKind::Standing && holder.state == HolderState::Granted
+    };
+    let unentered = state::held(view, robot_id).filter(is_unentered).count();
     (unentered <= 1).then_some(segment)
 }
 

@@ -53,7 +53,7 @@ use crate::rollout::projection::{RolloutProjection, Slot};
 use crate::rollout::robots::{due, machine};
 use crate::rollout::{absorb, cycle};
 use crate::rows::{Entry, Expect, Item, Key, Log, Record, Revision, Row, Seq, Table, Write};
-use crate::site::{DEMO, Site};
+use crate::site::{DEMO, PlaceKind, Site};
 use crate::time::{LinkTime, Now, SiteTime, Utc};
 use crate::update::{DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
 use crate::work::{InboxEntry, InboxItem, LaneMark, Live, RobotEvent, Sample, SampleBody, Session, WorkStats};
@@ -237,7 +237,7 @@ impl Rig {
         let mut place = self.row::<Place>(place_id.as_str()).unwrap_or(Place {
             place_id,
             capacity: u32::MAX,
-            standing: true,
+            kind: PlaceKind::Standing,
             holders: Vec::new(),
             quarantine: None,
             cleared: Vec::new(),

@@ -6,6 +6,7 @@ use midshift_core::identity::{Caller, TokenId};
 use midshift_core::ids::{PlaceId, RobotId};
 use midshift_core::reason::Refusal;
 use midshift_core::rows::{Item, Table, Writer};
+use midshift_core::site::PlaceKind;
 use midshift_core::task::{TaskIntake, TaskRequest};
 use midshift_proto::Denying;
 use midshift_proto::denying::Told;
@@ -211,7 +212,7 @@ async fn what_is_held_is_let_go_where_the_caller_operates() {
             &Place {
                 place_id,
                 capacity: 3,
-                standing: true,
+                kind: PlaceKind::Standing,
                 holders: vec![holder],
                 quarantine: None,
                 cleared: Vec::new(),
