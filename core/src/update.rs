@@ -147,7 +147,7 @@ pub struct UpdateReport {
     pub bundle: BundleId,
     /// Generation of the directive that asked for it. 0: not told.
     #[serde(default)]
-    pub directive: u64,
+    pub directive_generation: u64,
     /// The set that comes of it; none before it was planned.
     pub set: Option<SetId>,
     /// The drain in which it was activated or gone back from.

@@ -339,7 +339,7 @@ fn committed(rollout_id: &RolloutId, robot_id: RobotId, place: u64, at: Utc) -> 
         step: Step::Committed,
         since: at,
         from_version: String::new(),
-        directive: 1,
+        directive_generation: 1,
         signed: at,
         way_back: Default::default(),
         drain_id: None,

@@ -183,7 +183,7 @@ impl Hearer {
         let report = UpdateReport {
             state: UpdateState::Directed,
             bundle,
-            directive: update.generation,
+            directive_generation: update.generation,
             set: None,
             drain_id: None,
             grant_id: 0,

@@ -126,7 +126,8 @@ fn waits_for(
             waiting(drain).unwrap_or_else(|| Code::BlockedByDrain.into())
         }
         Step::Activating => {
-            let state = view.report_of(board, r).filter(|u| u.directive >= r.directive).map(|u| u.state);
+            let state =
+                view.report_of(board, r).filter(|u| u.directive_generation >= r.directive_generation).map(|u| u.state);
             match state {
                 Some(UpdateState::Probation) => {
                     since = r.moments.switched.unwrap_or(r.since);

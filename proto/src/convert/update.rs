@@ -69,7 +69,7 @@ impl From<&UpdateReport> for v1::UpdateReport {
     fn from(report: &UpdateReport) -> Self {
         Self {
             state: report.state.to_wire(),
-            directive: report.directive,
+            directive_generation: report.directive_generation,
             bundle: report.bundle.to_string(),
             set: text(report.set.as_ref()),
             drain_id: text(report.drain_id.as_ref()),
@@ -90,11 +90,11 @@ impl Parse<UpdateReport> for v1::UpdateReport {
         let grant_id = counted(self.grant_id, at.field("grant_id"), bad);
         let progress_permille = permille(self.progress_permille, at.field("progress_permille"), bad);
         let reason = maybe(self.reason, at.field("reason"), bad);
-        let directive = counted(self.directive, at.field("directive"), bad);
+        let directive_generation = counted(self.directive_generation, at.field("directive_generation"), bad);
         Some(UpdateReport {
             state: state?,
             bundle: bundle?,
-            directive: directive?,
+            directive_generation: directive_generation?,
             set: set?,
             drain_id: drain_id?,
             grant_id: grant_id?,

@@ -155,7 +155,7 @@ fn update_report() -> UpdateReport {
     UpdateReport {
         state: UpdateState::RollingBack,
         bundle: BundleId::parse(&"ab".repeat(32)).expect("id"),
-        directive: 11,
+        directive_generation: 11,
         set: Some(set()),
         drain_id: Some(drain()),
         grant_id: 12,

@@ -49,7 +49,7 @@ pub struct Proven {
     #[serde(default)]
     pub intended: Option<Committed>,
     /// Generation of the newest directive that was taken by an agent that keeps documents.
-    pub directive: u64,
+    pub directive_generation: u64,
     /// Sets that are committed, on trial or staged, by id.
     pub sets: BTreeMap<Digest, SetManifest>,
     /// Components without documents: they lay on the disk, or were on their way, before documents were kept.

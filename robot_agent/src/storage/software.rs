@@ -18,7 +18,7 @@ use std::collections::BTreeMap;
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct SoftwareRow {
     /// Generation of the newest directive that was taken.
-    pub directive: u64,
+    pub directive_generation: u64,
     /// Digest of its envelope; none: it was taken before that was written down.
     #[serde(default)]
     pub envelope: Option<Digest>,
@@ -43,7 +43,7 @@ impl SoftwareRow {
     /// As it is once this directive was taken.
     pub(crate) fn with(&self, directive: &Directive, desired: &DesiredUpdate) -> Self {
         let envelope = Some(Digest::of_content(desired.directive.as_bytes()));
-        Self { directive: directive.generation, envelope, update: None, ..self.clone() }
+        Self { directive_generation: directive.generation, envelope, update: None, ..self.clone() }
     }
     /// The newest update as it is reported.
     pub fn report(&self, progress_permille: u16) -> Option<UpdateReport> {
@@ -51,7 +51,7 @@ impl SoftwareRow {
         Some(UpdateReport {
             state: update.state,
             bundle: BundleId::parse(&update.bundle.to_string()).ok()?,
-            directive: self.directive,
+            directive_generation: self.directive_generation,
             set: update.set_name().and_then(|name| SetId::parse(&name).ok()),
             drain_id: update.drain_id.clone(),
             grant_id: self.grant_id,

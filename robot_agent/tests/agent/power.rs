@@ -339,10 +339,10 @@ fn live(home: &Path) {
     make_folder(&data).expect("makes");
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
     let mut store = runtime.block_on(SqliteStore::open(&data.join("agent.db"))).expect("opens");
-    let mut directive = 0;
+    let mut directive_generation = 0;
     let mut ledger = |_: &str| {
-        directive += 1;
-        let row = SoftwareRow { directive, ..SoftwareRow::default() };
+        directive_generation += 1;
+        let row = SoftwareRow { directive_generation, ..SoftwareRow::default() };
         runtime.block_on(store.commit(&[Op::Software(Box::new(row))])).expect("commits");
     };
     ledger("set up");

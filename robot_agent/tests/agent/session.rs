@@ -456,7 +456,7 @@ async fn a_robot_signs_what_it_has_installed_in_its_first_hello_with_a_key_that_
     let (store, releases) = (MemoryStore::new(), Releases::new());
     store.load_now("ring-1");
     // An agent that kept no documents has committed it.
-    let software = SoftwareRow { directive: 1, ..SoftwareRow::default() };
+    let software = SoftwareRow { directive_generation: 1, ..SoftwareRow::default() };
     store.commit_now(&[Op::Software(Box::new(software))]);
     let mut keys = Vec::new();
     for _ in 0..2 {

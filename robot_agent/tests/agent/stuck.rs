@@ -33,7 +33,7 @@ fn a_stuck_robot_goes_back_by_a_newer_order_once_its_kept_set_is_whole_again() {
         want(rig, order.to(Goal::Revert));
     };
     order_back(&mut rig, 3);
-    let told = report(&rig).map(|told| (told.state, told.directive));
+    let told = report(&rig).map(|told| (told.state, told.directive_generation));
     assert_eq!((told, rig.exit), (Some((UpdateState::Stuck, 3)), None), "it looked, and nothing was mended");
     rot();
     rig.pass(5_000);

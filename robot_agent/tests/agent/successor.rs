@@ -134,7 +134,7 @@ fn proven() -> Proven {
     let text = |name: &str| String::from_utf8_lossy(&documents[name]).into_owned();
     let release = Release::new(&text("1.root.json"), &text("2.targets.json"), &bundle.manifest.to_bytes());
     let set = set("v2", b"program", b"settings");
-    let mut proven = Proven { directive: 3, ..Proven::default() };
+    let mut proven = Proven { directive_generation: 3, ..Proven::default() };
     proven.committed.previous = Some("v1".to_owned());
     proven.intended = Some(proven.committed.clone());
     proven.believed = set.components.values().cloned().collect();
@@ -153,7 +153,7 @@ fn rows(state: UpdateState) -> Vec<Op> {
     let holder = Holder { intent, ..holder(attempt("T2", 1)) };
     let key = SecretKey::of_seed([5; 32]).public();
     let software = SoftwareRow {
-        directive: 3,
+        directive_generation: 3,
         envelope: Some(Digest::of_content(b"envelope")),
         keys: Some(HeldKeys { number: 2, from: vec![key.id()], keys: vec![key] }),
         grant_id: 8,

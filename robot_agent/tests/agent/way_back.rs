@@ -126,7 +126,7 @@ fn a_committed_set_is_left_by_a_directive_of_its_own_after_something_else_was_tr
     want(&mut rig, order.to(Goal::Revert));
     let rig = relaunch(rig);
     assert_eq!((state(&rig), switch(&rig).running()), (Some(UpdateState::RolledBack), "factory"));
-    let told = report(&rig).map(|r| (r.bundle.to_string(), r.directive));
+    let told = report(&rig).map(|r| (r.bundle.to_string(), r.directive_generation));
     assert_eq!(told, Some((first.digest.to_string(), 3)));
 }
 

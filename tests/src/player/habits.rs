@@ -311,7 +311,7 @@ impl Player {
         let update = UpdateReport {
             state,
             bundle,
-            directive: self.rng.random_range(0..3),
+            directive_generation: self.rng.random_range(0..3),
             set: None,
             drain_id: None,
             grant_id: 0,

@@ -78,7 +78,7 @@ impl Robot {
         matches!(self.state(), Some(UpdateState::Switching | UpdateState::Probation))
     }
     fn rollout(&self) -> Option<&RolloutId> {
-        self.told.get(&self.software.directive).map(|(_, rollout)| rollout)
+        self.told.get(&self.software.directive_generation).map(|(_, rollout)| rollout)
     }
 }
 
@@ -304,7 +304,7 @@ impl Changes {
         }
         looks.push(self.is_signed(robot_id, robot, switch, set));
         let Some(trial) = switch.trial.as_ref().filter(|trial| !trial.is_proven) else { return looks };
-        let told = robot.told.get(&robot.software.directive).cloned();
+        let told = robot.told.get(&robot.software.directive_generation).cloned();
         let still = told.as_ref().and_then(|(_, id)| self.rollouts.get(id)).and_then(|seen| seen.still_since_us);
         let age_us = still.map_or(0, |since| now_us.saturating_sub(since));
         let what = format!(

@@ -139,7 +139,11 @@ impl Rows {
         for ((desired, revision), robot) in self.desired.iter().zip(&self.robots) {
             let id = &desired.robot_id;
             ensure!(*id == robot.robot_id && *revision == Revision(1), "{id} was assigned {} times", revision.0);
-            ensure!(robot.step == Step::Staging && robot.directive == desired.generation, "{id} is {:?}", robot.step);
+            ensure!(
+                robot.step == Step::Staging && robot.directive_generation == desired.generation,
+                "{id} is {:?}",
+                robot.step
+            );
             let expected = Expected { robot_id: id, keys: &keys, generation: 0, now, bugs: Bugs::default() };
             let said = Directive::open(desired.directive.as_bytes(), &expected)?;
             ensure!(said.generation == desired.generation, "{id} has a directive of another generation");

@@ -33,7 +33,7 @@ pub fn new_robot(
         step: Step::Waiting,
         since: now.utc,
         from_version,
-        directive: 0,
+        directive_generation: 0,
         signed: Utc(0),
         way_back: WayBack::default(),
         drain_id: None,

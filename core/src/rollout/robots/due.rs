@@ -53,7 +53,7 @@ pub fn find_move(
     if r.lost.is_some() && !is_silent {
         return Some(Move::Heard);
     }
-    let report = view.report_of(board, r).filter(|report| report.directive >= r.directive);
+    let report = view.report_of(board, r).filter(|report| report.directive_generation >= r.directive_generation);
     let situation = Situation { view, board, now, rollout, r, report };
     let due = match r.step {
         Step::Waiting => situation.waiting(),
@@ -99,7 +99,7 @@ impl<'a> Situation<'a> {
     /// It has the bundle for a second try that will not come.
     fn keeps_for_nothing(self) -> bool {
         let staged = self.wants(Goal::Stage) || self.wants(Goal::Activate);
-        let ours = self.r.directive > 0 && self.r.never_ran() && self.claimed_by().is_none();
+        let ours = self.r.directive_generation > 0 && self.r.never_ran() && self.claimed_by().is_none();
         staged && ours && self.rollout.phase.goes_back()
     }
 
@@ -464,7 +464,7 @@ impl<'a> Situation<'a> {
         let is_unsaid = r.way_back.unstuck && r.way_back.generation == 0;
         if self.wants(Goal::Revert) && told == Some(drain_id) && !is_unsaid {
             // What it took does not end; what it did not take yet does.
-            let taken = report.is_some_and(|report| report.directive >= r.way_back.generation);
+            let taken = report.is_some_and(|report| report.directive_generation >= r.way_back.generation);
             return (old && !taken).then_some(Move::OrderBackAnew);
         }
         // A robot that its own safety system stopped goes back where it stands: to park would be motion.

@@ -259,7 +259,7 @@ fn roll_back(tx: &mut Tx, rollout: &Rollout, mut r: RolloutRobot, to: Step, why:
 fn write_stage(tx: &mut Tx, sign: &dyn Sign, rollout: &Rollout, mut r: RolloutRobot, to: Step) {
     let Some(generation) = write_directive(tx, sign, rollout, &r.robot_id, Goal::Stage, None) else { return };
     if r.step == Step::Waiting {
-        r.directive = generation;
+        r.directive_generation = generation;
     }
     r.signed = tx.now.wall;
     write_step(tx, r, to, "robot.staging");
@@ -329,7 +329,7 @@ fn change_desired(tx: &mut Tx, robot_id: &RobotId, change: impl FnOnce(&mut Desi
 
 /// A robot that has the bundle and never ran it forgets it.
 fn drop_bundle(tx: &mut Tx, r: &RolloutRobot) {
-    if r.directive > 0 && r.never_ran() {
+    if r.directive_generation > 0 && r.never_ran() {
         change_desired(tx, &r.robot_id, |d| (d.goal, d.drain_id, d.grant) = (Goal::Revert, None, None));
     }
 }

@@ -55,7 +55,7 @@ impl Rig {
         let words: Vec<&str> = desired.directive.split(' ').collect();
         let [generation, bundle, issued] = words[..] else { return };
         let (generation, bundle) = (generation.parse().expect("a number"), BundleId::parse(bundle).expect("an id"));
-        let named = robot.report.as_ref().is_some_and(|r| r.directive == generation);
+        let named = robot.report.as_ref().is_some_and(|r| r.directive_generation == generation);
         let over = robot.report.as_ref().is_some_and(|r| r.state == UpdateState::Committed);
         if robot.judged != desired.directive && desired.goal == Goal::Revert && (!named || over) {
             let why = match robot.fate {

@@ -526,11 +526,11 @@ fn same<R: PartialEq + std::fmt::Debug>(kept: &Slot<R>, fresh: &Slot<R>) {
     assert_eq!(kept, fresh, "the projection that was kept, and one built anew");
 }
 
-fn fresh_report(state: UpdateState, bundle: &BundleId, directive: u64) -> UpdateReport {
+fn fresh_report(state: UpdateState, bundle: &BundleId, directive_generation: u64) -> UpdateReport {
     UpdateReport {
         state,
         bundle: bundle.clone(),
-        directive,
+        directive_generation,
         set: None,
         drain_id: None,
         grant_id: 0,

@@ -27,7 +27,7 @@ fn applying() -> (Rig, Rollout) {
 fn reported(rig: &Rig, r: &RolloutRobot, state: Option<UpdateState>) -> Board {
     let mut board = rig.board.clone();
     let live = board.get_mut(&r.robot_id).expect("it is heard");
-    let report = state.map(|state| fresh_report(state, &bundle_id(2), r.directive));
+    let report = state.map(|state| fresh_report(state, &bundle_id(2), r.directive_generation));
     Arc::make_mut(live).report.update = report;
     board
 }

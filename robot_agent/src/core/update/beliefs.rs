@@ -208,7 +208,7 @@ impl AgentCore {
 
     fn open(&self, desired: &DesiredUpdate, now: Utc) -> Result<Directive, Reason> {
         let bugs = self.config.bugs;
-        let newest = if bugs.replays_are_taken() { 0 } else { self.kept.ledger.software.directive };
+        let newest = if bugs.replays_are_taken() { 0 } else { self.kept.ledger.software.directive_generation };
         let directive = self.opened(desired, newest, now).map_err(|rejection| refusal_of(&rejection))?;
         if self.lists(&directive.manifest, directive.manifest_length) || bugs.unlisted_is_fine() {
             Ok(directive)
@@ -231,7 +231,7 @@ impl AgentCore {
         if software.envelope == Some(Digest::of_content(desired.directive.as_bytes())) {
             return true;
         }
-        let newest = software.directive;
+        let newest = software.directive_generation;
         newest > 0 && self.opened(desired, newest - 1, Utc(0)).is_ok_and(|d| d.generation == newest)
     }
 

@@ -92,9 +92,9 @@ impl AgentCore {
 
     /// A directive was taken by an agent that keeps documents.
     pub(super) fn note_directive(&mut self, generation: u64) {
-        if self.kept.ledger.proven.as_ref().map_or(0, |proven| proven.directive) != generation {
+        if self.kept.ledger.proven.as_ref().map_or(0, |proven| proven.directive_generation) != generation {
             let proven = self.proven();
-            self.put_proven(Proven { directive: generation, ..proven });
+            self.put_proven(Proven { directive_generation: generation, ..proven });
         }
     }
 
@@ -104,13 +104,13 @@ impl AgentCore {
         let software = &self.kept.ledger.software;
         let update = software.update.as_ref();
         let is_older = match &self.kept.ledger.proven {
-            Some(proven) => software.directive > proven.directive,
-            None => software.directive > 0 || update.is_some(),
+            Some(proven) => software.directive_generation > proven.directive_generation,
+            None => software.directive_generation > 0 || update.is_some(),
         };
         let set = update.and_then(|u| u.set.clone());
         let mut proven = self.proven();
         if is_older {
-            proven.directive = software.directive;
+            proven.directive_generation = software.directive_generation;
             proven.adopt(holdings, set.as_ref());
             let sets: Vec<String> = proven.sets.keys().map(ToString::to_string).collect();
             tracing::warn!(robot_id = %self.config.robot_id, ?sets, "sets without release documents are believed by their manifests, once");

@@ -13,7 +13,7 @@ use midshift_core::work::RobotEvent;
 
 impl AgentCore {
     pub(super) fn put_software(&mut self, row: SoftwareRow) {
-        self.note_directive(row.directive);
+        self.note_directive(row.directive_generation);
         self.write(Op::Software(Box::new(row)), true);
     }
 

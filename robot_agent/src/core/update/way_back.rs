@@ -35,7 +35,7 @@ impl AgentCore {
                 return false;
             }
         };
-        let opened = self.opened(&desired, software.directive, trusted.now(self.reading(now)));
+        let opened = self.opened(&desired, software.directive_generation, trusted.now(self.reading(now)));
         if opened == Err(Rejection::NotSigned) && self.update.keys_asked.as_ref() != Some(&desired.directive) {
             // The server may sign with a key that came since.
             self.ask_to_refresh(now, trusted, self.reading(now));

@@ -122,7 +122,7 @@ pub struct WayBack {
 impl WayBack {
     /// Whether what a robot says of its update comes after the order that it was given.
     pub const fn is_answered_by(&self, report: &UpdateReport) -> bool {
-        !self.unstuck || (self.generation > 0 && report.directive >= self.generation)
+        !self.unstuck || (self.generation > 0 && report.directive_generation >= self.generation)
     }
 }
 
@@ -153,7 +153,7 @@ pub struct RolloutRobot {
     /// What it ran before.
     pub from_version: String,
     /// Generation of the directive that was signed for it first. 0: none was.
-    pub directive: u64,
+    pub directive_generation: u64,
     /// When the newest was signed, UTC of the wall.
     pub signed: Utc,
     /// The order to go back that it was given last.

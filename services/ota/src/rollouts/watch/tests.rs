@@ -86,7 +86,7 @@ fn on_trial() -> RolloutRobot {
         step: Step::Trial,
         since: Utc(0),
         from_version: "1.4.0".into(),
-        directive: 1,
+        directive_generation: 1,
         signed: Utc(0),
         way_back: WayBack::default(),
         drain_id: None,
