@@ -8,7 +8,7 @@ use crate::client::{Exit, follow};
 use crate::out::{Format, Out};
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use midshift_proto::ota::v1::{self, RolloutEnding, RolloutPhase};
+use midshift_proto::ota::v1::{self, RolloutOutcome, RolloutPhase};
 use prost_types::Timestamp;
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -108,7 +108,7 @@ pub fn end(rollout: &v1::Rollout, until: Until) -> Option<Result<(), Exit>> {
     };
     let exit =
         |code, what: String| Some(Err(Exit::new(code, format!("{id} {what}\n  try: midshift rollout get {id}"))));
-    let is_incomplete = rollout.outcome() == RolloutEnding::Incomplete;
+    let is_incomplete = rollout.outcome() == RolloutOutcome::Incomplete;
     let judge = format!("midshift rollout promote {id}, or midshift rollout abort {id}");
     match phase {
         RolloutPhase::Completed if is_incomplete => {

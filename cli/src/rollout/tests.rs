@@ -6,9 +6,7 @@ use crate::pages::Listed;
 use clap::Parser;
 use midshift_core::reason::{Code, Reason};
 use midshift_proto::convert::{duration, shown};
-use midshift_proto::ota::v1::{
-    self, RolloutEnding, RolloutOutcome, RolloutPause, RolloutPhase, RolloutStep, Suspicion,
-};
+use midshift_proto::ota::v1::{self, GateOutcome, RolloutOutcome, RolloutPause, RolloutPhase, RolloutStep, Suspicion};
 use prost_types::Timestamp;
 
 fn at(seconds: i64) -> Option<Timestamp> {
@@ -66,7 +64,7 @@ fn rollout() -> v1::Rollout {
 fn unproven() -> v1::RolloutVerdict {
     v1::RolloutVerdict {
         wave: 0,
-        outcome: RolloutOutcome::PromotedUnproven as i32,
+        outcome: GateOutcome::PromotedUnproven as i32,
         reason: Some(shown(&Reason::from(Code::GateUnproven))),
         attempted: 1,
         clean: 1,
@@ -209,7 +207,7 @@ fn an_unproven_verdict_says_what_is_known_and_no_more() {
 #[test]
 fn an_abort_among_few_says_what_it_costs_a_good_bundle() {
     let verdict = v1::RolloutVerdict {
-        outcome: RolloutOutcome::Aborted as i32,
+        outcome: GateOutcome::Aborted as i32,
         clean: 3,
         failed: 1,
         attempted: 5,
@@ -358,7 +356,7 @@ fn a_wait_ends_with_the_code_of_its_end() {
     let both = |rollout: &v1::Rollout| [code(rollout, Until::Completed), code(rollout, Until::Ended)];
     assert_eq!(both(&rollout()), [None, None]);
     assert_eq!(both(&of(RolloutPhase::Completed)), [Some(0), Some(0)]);
-    let short = v1::Rollout { outcome: RolloutEnding::Incomplete as i32, ..of(RolloutPhase::Completed) };
+    let short = v1::Rollout { outcome: RolloutOutcome::Incomplete as i32, ..of(RolloutPhase::Completed) };
     assert_eq!(both(&short), [Some(14), Some(14)]);
     assert_eq!(both(&of(RolloutPhase::Review)), [Some(11), None]);
     assert_eq!(both(&aborted(RolloutPhase::Aborting)), [Some(12), None]);

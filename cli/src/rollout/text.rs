@@ -69,7 +69,7 @@ pub fn state(rollout: &v1::Rollout) -> String {
     let pauses = pauses(rollout);
     let phase = phase(rollout.phase());
     match rollout.outcome() {
-        v1::RolloutEnding::Incomplete => format!("{phase}, INCOMPLETE"),
+        v1::RolloutOutcome::Incomplete => format!("{phase}, INCOMPLETE"),
         _ if pauses.is_empty() => phase.to_owned(),
         _ => format!("{phase}, paused ({pauses})"),
     }
@@ -177,7 +177,7 @@ pub fn header(rollout: &v1::Rollout) -> Vec<String> {
     }
     lines.push(format!("  {}", facts.join(", ")));
     lines.extend(acts_on_rates(rollout).map(|line| format!("  {line}")));
-    if rollout.outcome() == v1::RolloutEnding::Incomplete {
+    if rollout.outcome() == v1::RolloutOutcome::Incomplete {
         lines.push(format!("  {}", incomplete(rollout)));
     }
     let cost = effort(rollout.trial_effort.as_ref(), rollout.control_effort.as_ref());
@@ -292,14 +292,14 @@ fn branches(all: Vec<(String, Vec<String>)>) -> Vec<String> {
 
 /// The word of an outcome.
 pub fn outcome(verdict: &v1::RolloutVerdict) -> &'static str {
-    verdict.outcome().as_str_name().trim_start_matches("ROLLOUT_OUTCOME_")
+    verdict.outcome().as_str_name().trim_start_matches("GATE_OUTCOME_")
 }
 
 /// What so many robots prove, and what they do not.
 pub fn bound(verdict: &v1::RolloutVerdict) -> String {
     let known = format!("fewer than {} fail, with 95 % confidence", percent(verdict.upper_bound_permille));
     match verdict.outcome() {
-        v1::RolloutOutcome::PromotedUnproven => {
+        v1::GateOutcome::PromotedUnproven => {
             format!("unproven: of {}, no more is known than that {known}", robots(verdict.clean + verdict.failed))
         }
         _ => known,

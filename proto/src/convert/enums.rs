@@ -82,8 +82,8 @@ wire_enums! {
         Operator = Operator, Infrastructure = Infrastructure, InfrastructureUnknown = InfrastructureUnknown, Revoked = Revoked,
         Keyless = Keyless, Content = Content,
     }
-    Ending = ota::v1::RolloutEnding { Complete = Complete, Incomplete = Incomplete }
-    Outcome = ota::v1::RolloutOutcome {
+    Ending = ota::v1::RolloutOutcome { Complete = Complete, Incomplete = Incomplete }
+    Outcome = ota::v1::GateOutcome {
         Promoted = Promoted, PromotedUnproven = PromotedUnproven, PromotedByPerson = PromotedByPerson, Review = Review, Aborted = Aborted,
     }
     RolloutStep = ota::v1::RolloutStep {

@@ -48,7 +48,7 @@ const FATES: &[(&str, Fate)] = &[
     ("link.v1.WorkState", Fate::Kept),
     ("ota.v1.AbortScope", Fate::Refused),
     ("ota.v1.Encoding", Fate::Refused),
-    ("ota.v1.RolloutEnding", Fate::Shown),
+    ("ota.v1.GateOutcome", Fate::Shown),
     ("ota.v1.RolloutOutcome", Fate::Shown),
     ("ota.v1.RolloutPause", Fate::Shown),
     ("ota.v1.RolloutPhase", Fate::Shown),

@@ -193,7 +193,7 @@ pub fn all(c: &v1::RolloutCounts) -> u32 {
 
 /// A verdict with its numbers. Waves are counted from 1 for people.
 pub fn verdict(v: &v1::RolloutVerdict) -> String {
-    let outcome = short(v.outcome().as_str_name(), "ROLLOUT_OUTCOME_");
+    let outcome = short(v.outcome().as_str_name(), "GATE_OUTCOME_");
     let n = v.clean + v.failed;
     let mut text = format!(
         "wave {}: {outcome}, n {n}, failed {}, failure rate below {:.1} % with 95 % confidence",
