@@ -237,10 +237,7 @@ impl From<&AreaPolicy> for v1::AreaRules {
             area_id: policy.area_id.to_string(),
             speed_limit_mm_s: policy.speed_limit_mm_s,
             avoidance_distance_mm: policy.avoidance_distance_mm,
-            charge_mandatory_permille: u32::from(policy.charge_mandatory_permille),
-            charge_opportunistic_permille: u32::from(policy.charge_opportunistic_permille),
             charge_stop_permille: u32::from(policy.charge_stop_permille),
-            charge_preemptible_permille: u32::from(policy.charge_preemptible_permille),
             without_people: policy.without_people,
         }
     }
@@ -249,20 +246,13 @@ impl From<&AreaPolicy> for v1::AreaRules {
 impl Parse<AreaPolicy> for v1::AreaRules {
     fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<AreaPolicy> {
         let area_id = id(&self.area_id, AreaId::parse, at.field("area_id"), bad);
-        let mandatory = permille(self.charge_mandatory_permille, at.field("charge_mandatory_permille"), bad);
-        let opportunistic =
-            permille(self.charge_opportunistic_permille, at.field("charge_opportunistic_permille"), bad);
         let stop = permille(self.charge_stop_permille, at.field("charge_stop_permille"), bad);
-        let preemptible = permille(self.charge_preemptible_permille, at.field("charge_preemptible_permille"), bad);
         Some(AreaPolicy {
             speed_limit_mm_s: self.speed_limit_mm_s,
             avoidance_distance_mm: self.avoidance_distance_mm,
-            charge_mandatory_permille: mandatory?,
-            charge_opportunistic_permille: opportunistic?,
             charge_stop_permille: stop?,
-            charge_preemptible_permille: preemptible?,
             without_people: self.without_people,
-            // When people are told and what roll-outs keep to is no robot's matter.
+            // When it goes to charge, when people are told and what roll-outs keep to is no robot's matter.
             ..AreaPolicy::default_of(area_id?)
         })
     }
