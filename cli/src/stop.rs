@@ -224,7 +224,7 @@ mod tests {
     #[test]
     fn nobody_knows_what_a_robot_does_that_is_not_heard_now() {
         let robot = |heard, heard_unix_ms, standstill| {
-            let obeys = if standstill { StopLevel::Halt } else { StopLevel::Unspecified }.into();
+            let obeys = if standstill { StopLevel::Halt } else { StopLevel::None }.into();
             v1::RobotStatus { heard, heard_unix_ms, standstill, obeys, ..v1::RobotStatus::default() }
         };
         let shown = |robot: &v1::RobotStatus| of_robot(robot)[1..4].join(" ");

@@ -228,7 +228,7 @@ impl Robot<'_> {
     async fn check_in(&mut self) -> anyhow::Result<()> {
         self.nonce += 1;
         let inside: Vec<String> = lock(self.seen).stops.iter().cloned().collect();
-        let obeys = if inside.is_empty() { StopLevel::Unspecified } else { StopLevel::Halt };
+        let obeys = if inside.is_empty() { StopLevel::None } else { StopLevel::Halt };
         let check_in = CheckIn {
             nonce: self.nonce,
             generation: self.generation,

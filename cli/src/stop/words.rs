@@ -23,9 +23,12 @@ pub fn level(number: i32) -> &'static str {
     StopLevel::try_from(number).map_or("?", |level| level.as_str_name().trim_start_matches("STOP_LEVEL_"))
 }
 
-/// A level that somebody obeys; none is said as `-`.
+/// A level that somebody obeys; no stop, and nothing known, is said as `-`.
 pub fn obeys(number: i32) -> String {
-    if number == 0 { "-".to_owned() } else { level(number).to_owned() }
+    match StopLevel::try_from(number) {
+        Ok(StopLevel::Unspecified | StopLevel::None) => "-".to_owned(),
+        _ => level(number).to_owned(),
+    }
 }
 
 /// Whom a stop is for.

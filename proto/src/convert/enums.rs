@@ -58,8 +58,8 @@ wire_enums! {
     FaultClass = common::v1::FaultClass { Recoverable = Recoverable, Mechanical = Mechanical, Stop = Stop, Semantic = Semantic } => Unknown
     Lane = link::v1::Lane { Critical = Critical, Event = Event, Status = Status }
     Mode = link::v1::Mode { Automatic = Automatic, Manual = Manual, Service = Service }
-    StopLevel = common::v1::StopLevel { None = Unspecified, Slow = Slow, Halt = Halt, ControlledStopPosture = ControlledStopPosture }
-    HardwareStop = link::v1::HardwareStop { None = Unspecified, Manual = Manual, AutoAck = AutoAck, Remote = Remote }
+    StopLevel = common::v1::StopLevel { None = None, Slow = Slow, Halt = Halt, ControlledStopPosture = ControlledStopPosture }
+    HardwareStop = link::v1::HardwareStop { None = None, Manual = Manual, AutoAck = AutoAck, Remote = Remote }
     Stage = stop::v1::SilenceStage { Heard = Heard, Slow = Slow, Stand = Stand }
     WorkState = link::v1::WorkState {
         Accepted = Accepted, Refused = Refused, Navigating = Navigating, Executing = Executing, Paused = Paused, Stopping = Stopping,

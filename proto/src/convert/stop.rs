@@ -90,7 +90,7 @@ impl Parse<Stop> for v1::Stop {
         let level = word(self.level, at.field("level"), bad).filter(|level| {
             let is_one = *level != StopLevel::None;
             if !is_one {
-                bad.add(at.field("level").to_string(), "UNSPECIFIED is not a value");
+                bad.add(at.field("level").to_string(), "NONE stops nobody");
             }
             is_one
         });
@@ -447,18 +447,21 @@ mod tests {
             assert_eq!(parse::<ToStop, _>(v1::AttendRequest::from(&said)), Ok(said));
         }
         let message = Some(v1::attend_request::Message::CheckIn(v1::CheckIn::default()));
-        let refusal = parse::<ToStop, _>(v1::AttendRequest { message }).expect_err("no silence stage");
-        assert_eq!(refusal.violations[0].field, "check_in.silence");
+        let refusal = parse::<ToStop, _>(v1::AttendRequest { message }).expect_err("neither level nor stage");
+        let fields: Vec<_> = refusal.violations.iter().map(|violation| violation.field.as_str()).collect();
+        assert_eq!(fields, ["check_in.obeys", "check_in.silence"]);
     }
 
     #[test]
     fn a_stop_hears_every_rule_it_breaks() {
-        let wire =
-            v1::Stop { stop_id: "?".to_owned(), scope: None, level: 0, reason: "x".repeat(300), ..(&stop()).into() };
-        let refusal = parse::<Stop, _>(wire).expect_err("it breaks four rules");
-        let said = format!("{refusal:?}");
-        for field in ["stop_id", "scope", "level", "reason"] {
-            assert!(said.contains(field), "{field}: {said}");
+        for level in [0, StopLevel::None.to_wire()] {
+            let (stop_id, reason) = ("?".to_owned(), "x".repeat(300));
+            let wire = v1::Stop { stop_id, scope: None, level, reason, ..(&stop()).into() };
+            let refusal = parse::<Stop, _>(wire).expect_err("it breaks four rules");
+            let said = format!("{refusal:?}");
+            for field in ["stop_id", "scope", "level", "reason"] {
+                assert!(said.contains(field), "{field}: {said}");
+            }
         }
     }
 }

@@ -473,6 +473,16 @@ fn a_session_that_breaks_the_shape_hears_every_field() {
 }
 
 #[test]
+fn a_robot_that_says_nothing_of_what_stops_it_is_refused() {
+    let silent = v1::ReportedState { stop_level: 0, hardware_stop: 0, ..(&reported()).into() };
+    let refusal = parse::<ReportedState, _>(silent).expect_err("silence is no word");
+    let fields: Vec<&str> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
+    assert_eq!(fields, ["stop_level", "hardware_stop"]);
+    let free = ReportedState { stop_level: StopLevel::None, hardware_stop: HardwareStop::None, ..reported() };
+    assert_eq!(parse::<ReportedState, _>(v1::ReportedState::from(&free)), Ok(free));
+}
+
+#[test]
 fn a_hello_with_more_of_what_is_installed_than_may_be_is_refused() {
     let with = |installed: String| up(&FromRobot::Hello(Box::new(Hello { installed, ..hello() })));
     assert!(with("x".repeat(limits::INSTALLED_BYTES_MAX)).is_ok());

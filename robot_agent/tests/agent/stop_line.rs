@@ -163,7 +163,7 @@ impl Bench {
         let mut line = self.line().await;
         line.attend().await;
         line.synced(1).await;
-        line.until(1, |c| c.obeys == 0).await;
+        line.until(1, |c| c.obeys == NO_STOP).await;
         line
     }
     async fn end(self) {
@@ -172,11 +172,8 @@ impl Bench {
     }
 }
 
-const HALT: i32 = v1_halt();
-
-const fn v1_halt() -> i32 {
-    midshift_proto::common::v1::StopLevel::Halt as i32
-}
+const NO_STOP: i32 = midshift_proto::common::v1::StopLevel::None as i32;
+const HALT: i32 = midshift_proto::common::v1::StopLevel::Halt as i32;
 
 #[tokio::test(start_paused = true)]
 async fn it_attends_is_told_and_checks_in_each_second_with_numbers_that_never_come_again() {
@@ -259,7 +256,7 @@ async fn a_service_that_reads_and_never_answers_is_left_after_three_seconds_and_
     while hung.next().await.is_some() {}
     next.attend().await;
     next.synced(1).await;
-    next.until(1, |c| c.obeys == 0).await;
+    next.until(1, |c| c.obeys == NO_STOP).await;
     bench.end().await;
 }
 
@@ -383,7 +380,7 @@ async fn asked_to_move_over_it_has_the_next_line_before_it_leaves_this_one() {
     next.attend().await;
     next.synced(4).await;
     let said = next.until(4, |c| c.generation == 4).await;
-    assert_eq!(said.obeys, 0, "nothing moved over but the line");
+    assert_eq!(said.obeys, NO_STOP, "nothing moved over but the line");
     while old.next().await.is_some() {}
     bench.end().await;
 }

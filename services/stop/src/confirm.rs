@@ -43,7 +43,8 @@ pub fn count(counts: &mut v1::Counts, confirmation: Confirmation) {
 #[derive(Clone, Copy, PartialEq, Eq)]
 struct Found {
     confirmation: Confirmation,
-    obeys: StopLevel,
+    /// By its newest report; none: it was never heard.
+    obeys: Option<StopLevel>,
     is_elsewhere: bool,
 }
 
@@ -61,7 +62,7 @@ fn encode(robot_id: &RobotId, found: &Found, now: &Now) -> v1::RobotStop {
         confirmation: word.into(),
         unreachable_since_unix_ms: since.map_or(0, |at| wall_at(now, at).0),
         self_stop_by_unix_ms: by.map_or(0, |at| wall_at(now, at).0),
-        obeys: found.obeys.to_wire(),
+        obeys: found.obeys.map_or(0, WireEnum::to_wire),
         elsewhere: found.is_elsewhere,
     }
 }
@@ -97,7 +98,7 @@ impl Watching<'_> {
             let heard = said.heard.as_ref();
             let one = Found {
                 confirmation: confirmation(&self.stop, since, &robot.robot_id, heard, now.link),
-                obeys: heard.map(|h| h.level).unwrap_or_default(),
+                obeys: heard.map(|h| h.level),
                 is_elsewhere: is_elsewhere(&self.stop, since, &robot.robot_id, heard, now.link),
             };
             found.insert(robot.robot_id.clone(), one);
@@ -105,7 +106,7 @@ impl Watching<'_> {
         if let Scope::Robot(robot_id) = &self.stop.scope {
             // One that nobody knows of: nobody knows either whether it stands.
             let confirmation = confirmation(&self.stop, since, robot_id, None, now.link);
-            let unknown = Found { confirmation, obeys: StopLevel::None, is_elsewhere: false };
+            let unknown = Found { confirmation, obeys: None, is_elsewhere: false };
             found.entry(robot_id.clone()).or_insert(unknown);
         }
         for (robot_id, one) in &found {

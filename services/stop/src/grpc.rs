@@ -25,9 +25,13 @@ const WATCH_MAX: usize = 4;
 
 fn wanted(r: v1::EngageRequest, by: &Caller) -> Result<Wanted, Refusal> {
     let mut bad = Violations::default();
-    let level = StopLevel::from_wire(r.level);
+    let level = match r.level {
+        // Whoever says none means the one that stops.
+        0 => Some(StopLevel::Halt),
+        number => StopLevel::from_wire(number).filter(|level| *level != StopLevel::None),
+    };
     if level.is_none() {
-        bad.add("level", format!("{} is not a known value", r.level));
+        bad.add("level", format!("{} is not the level of a stop", r.level));
     }
     if r.reason.len() > limits::REASON_BYTES_MAX {
         bad.add("reason", format!("must be at most {} bytes", limits::REASON_BYTES_MAX));
@@ -45,7 +49,7 @@ fn wanted(r: v1::EngageRequest, by: &Caller) -> Result<Wanted, Refusal> {
     };
     bad.finish()?;
     let scope = scope.ok_or_else(|| Refusal::field("scope", "cannot be read"))?;
-    let level = level.filter(|level| *level != StopLevel::None).unwrap_or(StopLevel::Halt);
+    let level = level.ok_or_else(|| Refusal::field("level", "cannot be read"))?;
     let asked =
         v1::EngageRequest { level: level.to_wire(), request_id: String::new(), site_id: String::new(), ..r.clone() };
     let hash: String = Sha256::digest(asked.encode_to_vec()).iter().map(|byte| format!("{byte:02x}")).collect();

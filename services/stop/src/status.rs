@@ -112,7 +112,7 @@ pub fn status(inner: &Inner) -> v1::Status {
         tally.add(&robot.robot_id, heard, &now);
         robots.push(v1::RobotStatus {
             robot_id: robot.robot_id.to_string(),
-            obeys: heard.map(|h| h.level).unwrap_or_default().to_wire(),
+            obeys: heard.map_or(0, |h| h.level.to_wire()),
             standstill: heard.is_some_and(|h| h.is_still),
             heard_unix_ms: heard.map_or(0, |h| wall_at(&now, h.at).0),
             awaiting_resume: heard.map(|h| names(&h.awaiting)).unwrap_or_default(),

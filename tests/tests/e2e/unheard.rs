@@ -54,7 +54,7 @@ async fn a_server_that_is_killed_again_and_again_silences_no_robot_and_the_end_o
     let status = client.get_status(GetStatusRequest {}).await?.into_inner().status.unwrap_or_default();
     ensure!(status.robots.len() == ROBOTS && status.stops.is_empty(), "{status:?}");
     for robot in &status.robots {
-        let waits = !robot.awaiting_resume.is_empty() || robot.obeys() != Shown::Unspecified;
+        let waits = !robot.awaiting_resume.is_empty() || robot.obeys() != Shown::None;
         ensure!(robot.heard_unix_ms > 0 && !waits, "{robot:?}");
     }
     for journal in robots.journals() {

@@ -371,6 +371,7 @@ class Robot:
             load=self.memory["load"] and link.Load(**self.memory["load"]),
             attempts=[json_format.ParseDict(a, link.ReportedAttempt()) for a in self.memory["unclosed"].values()],
             stop_level=self.stops.level if self.stops else NONE,
+            hardware_stop=link.HARDWARE_STOP_NONE,
             stops=self.stops.inside if self.stops else [],
             awaiting_resume=self.stops.awaiting if self.stops else [],
         )

@@ -21,7 +21,7 @@ from .identity import Identity
 from .memory import Memory
 from .stream import Stream, now_ms, say
 
-NONE, SLOW = common_pb2.STOP_LEVEL_UNSPECIFIED, common_pb2.STOP_LEVEL_SLOW
+NONE, SLOW = common_pb2.STOP_LEVEL_NONE, common_pb2.STOP_LEVEL_SLOW
 HALT, POSTURE = common_pb2.STOP_LEVEL_HALT, common_pb2.STOP_LEVEL_CONTROLLED_STOP_POSTURE
 HEARD, STAGE_SLOW, STAND = wire.SILENCE_STAGE_HEARD, wire.SILENCE_STAGE_SLOW, wire.SILENCE_STAGE_STAND
 CHECK_IN_MS = 1_000

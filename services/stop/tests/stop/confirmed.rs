@@ -79,7 +79,7 @@ async fn a_robot_elsewhere_is_shown_as_outside_and_slow_is_done_when_it_is_known
     let server = Server::start(&folder.path()).await;
     let mut here = Robot::dial(&server, "here", vec![]).await.synced().await;
     let mut there = Robot::dial(&server, "there", vec![]).await.synced().await;
-    let slow = v1::EngageRequest { level: 1, ..scope(W::RobotId("here".to_owned())) };
+    let slow = v1::EngageRequest { level: crate::harness::slow(), ..scope(W::RobotId("here".to_owned())) };
     let mut stream = server.client().await.engage(slow).await.unwrap().into_inner();
     // With the word of the one that is meant the stream is over.
     for robot in [&mut there, &mut here] {
@@ -125,7 +125,7 @@ async fn a_stop_of_one_robot_waits_for_the_word_of_no_other() {
     away.write(&folder.path()).unwrap();
     eventually(async || (server.status().await.robots.len() == 1).then_some(())).await;
     let mut here = Robot::dial(&server, "here", vec![]).await.synced().await;
-    let slow = v1::EngageRequest { level: 1, ..scope(W::RobotId("here".to_owned())) };
+    let slow = v1::EngageRequest { level: crate::harness::slow(), ..scope(W::RobotId("here".to_owned())) };
     let mut stream = server.client().await.engage(slow).await.unwrap().into_inner();
     here.until(|robot| robot.effective().len() == 1).await;
     let said = here.obeying(false);

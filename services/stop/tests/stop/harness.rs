@@ -363,6 +363,11 @@ pub fn code(result: Result<impl Sized, Status>) -> Code {
     result.err().map_or(Code::Ok, |status| status.code())
 }
 
+pub fn slow() -> i32 {
+    use midshift_proto::convert::WireEnum;
+    StopLevel::Slow.to_wire()
+}
+
 pub fn halt() -> i32 {
     use midshift_proto::convert::WireEnum;
     StopLevel::Halt.to_wire()

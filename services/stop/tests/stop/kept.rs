@@ -2,9 +2,11 @@
 
 use crate::harness::{Folder, Robot, Server, code, eventually, fleet, halt, id_of, scope, told};
 use midshift_core::limits;
+use midshift_core::robot::StopLevel;
 use midshift_core::site::{DEMO, text};
 use midshift_core::time::{ScaledClock, Utc};
 use midshift_proto::access::local;
+use midshift_proto::convert::WireEnum;
 use midshift_proto::refusal_of;
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::scope::Scope as W;
@@ -209,11 +211,13 @@ async fn what_cannot_be_engaged_is_refused_with_every_reason_and_nothing_is_enga
     let folder = Folder::new();
     let site = Arc::new(text::parse(DEMO).unwrap());
     let server = Server::with_site(&folder.path(), Some(site)).await;
-    let (reason, request_id) = ("x".repeat(257), "with spaces".to_owned());
-    let bad = v1::EngageRequest { level: 99, reason, request_id, ..v1::EngageRequest::default() };
-    let answer = refusal_of(&server.engage(bad).await.unwrap_err());
-    let fields: Vec<&str> = answer.violations.iter().map(|v| v.field.as_str()).collect();
-    assert_eq!(fields, ["level", "reason", "request_id", "scope"]);
+    for level in [99, StopLevel::None.to_wire()] {
+        let (reason, request_id) = ("x".repeat(257), "with spaces".to_owned());
+        let bad = v1::EngageRequest { level, reason, request_id, ..v1::EngageRequest::default() };
+        let answer = refusal_of(&server.engage(bad).await.unwrap_err());
+        let fields: Vec<&str> = answer.violations.iter().map(|v| v.field.as_str()).collect();
+        assert_eq!(fields, ["level", "reason", "request_id", "scope"], "{level}");
+    }
     let refused = server.engage(scope(W::Zone("nowhere".to_owned()))).await.unwrap_err();
     assert_eq!(refused.code(), Code::NotFound);
     assert!(refused.message().contains("A01"), "{}", refused.message());
