@@ -98,7 +98,7 @@ fn a_canary_whose_program_hangs_and_whose_body_is_stopped_goes_back_and_moves_wh
         let canary = scene.some_is_in(UpdateState::Probation);
         let row = stopped_canaries_go_back(&mut scene, &[canary], first);
         let code = row.abort.map(|abort| abort.reason.code);
-        let wanted = if first == First::Person { Code::AbortedByUser } else { Code::FailureAmongFew };
+        let wanted = if first == First::Person { Code::AbortedByPerson } else { Code::FailureAmongFew };
         assert_eq!(code, Some(wanted));
     }
 }
@@ -140,7 +140,7 @@ fn a_person_ends_a_roll_out_whose_canaries_were_stopped_too_late_to_count_and_th
     scene.pass(limits::HARDWARE_STOP_COUNTS.as_ms() + 10_000);
     each_moves(&mut scene, "the canaries to work", &canaries);
     let row = stopped_canaries_go_back(&mut scene, &canaries, First::Person);
-    assert_eq!(row.abort.map(|a| a.reason.code), Some(Code::AbortedByUser));
+    assert_eq!(row.abort.map(|a| a.reason.code), Some(Code::AbortedByPerson));
 }
 
 /// From the moment of its switch on a canary does not reach its server, alone or like everybody, until it has gone back by itself.

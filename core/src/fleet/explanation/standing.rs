@@ -161,7 +161,7 @@ fn unknown(a: &Attempt, live: Option<&std::sync::Arc<Live>>) -> Option<Reason> {
                 }
             },
         ),
-        Code::ManualMode if is_manual => (
+        Code::RobotManual if is_manual => (
             format!("a person at robot {robot_id}"),
             "It is known again once the robot is back in automatic mode and reports it.",
         ),

@@ -166,7 +166,7 @@ fn mode_changed(tx: &mut Tx, robot_id: &RobotId, mode: Mode) {
     if mode == Mode::Automatic {
         return;
     }
-    let why = Reason::from(Code::ManualMode).with("robot_id", robot_id);
+    let why = Reason::new(Code::RobotManual, "A person took the robot over.").with("robot_id", robot_id);
     match tx.view.held_by(robot_id).map(|a| a.subject.task_id().cloned()) {
         Some(Some(task_id)) => {
             apply_event(tx, &task_id, News::from_event(Event::LeaseOver, Some(&why)));

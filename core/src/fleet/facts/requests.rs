@@ -56,7 +56,7 @@ fn cancel(tx: &mut Tx, task_id: &TaskId, force: bool, request: &TaskRequest) {
     let Some(mut task) = tx.view.task(task_id).cloned() else { return };
     task.cancel_requested = Some(tx.now.utc);
     tx.put_row(task, "task.cancel_requested");
-    let code = if force { Code::Forced } else { Code::CanceledByUser };
+    let code = if force { Code::Forced } else { Code::CanceledByPerson };
     let why = Reason::new(code, request.reason.clone()).with("actor", &request.actor);
     let event = if force { Event::CancelForce } else { Event::Cancel };
     apply_event(tx, task_id, News::from_event(event, Some(&why)));
@@ -99,7 +99,7 @@ fn resolve(tx: &mut Tx, task_id: &TaskId, resolution: Resolution, request: &Task
         Resolution::Failed | Resolution::FailedItemLost => Event::ResolveFailed,
         Resolution::Canceled => Event::ResolveCanceled,
     };
-    let why = Reason::new(Code::ResolvedByUser, request.reason.clone()).with("actor", &request.actor);
+    let why = Reason::new(Code::ResolvedByPerson, request.reason.clone()).with("actor", &request.actor);
     apply_event(tx, task_id, News::from_event(event, Some(&why)));
 }
 

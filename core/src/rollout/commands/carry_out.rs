@@ -228,12 +228,12 @@ fn carry_out_verb(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor
                 &rollout,
                 &seen,
                 Outcome::PromotedByPerson,
-                why(Code::PromotedByUser),
+                why(Code::PromotedByPerson),
                 tx.now.utc,
             );
             advance::promote(tx, rollout, Verdict { actor: Some(actor.to_string()), ..verdict });
         }
-        Verb::Abort => advance::abort(tx, rollout, why(Code::AbortedByUser), false, None, Some(actor.to_string())),
+        Verb::Abort => advance::abort(tx, rollout, why(Code::AbortedByPerson), false, None, Some(actor.to_string())),
         Verb::Exclude(robot_id) => {
             let row = RolloutRobot::id_of(id, robot_id);
             moves::apply(tx, &NoSign, board, &row, Move::Skip(why(Code::SkippedExcluded)));
@@ -317,7 +317,7 @@ fn retry_failed(view: &mut RolloutProjection, now: Now, id: &RolloutId, actor: &
                 tx.delete::<Quarantine>(&key, "quarantine.lifted");
                 let fresh =
                     assign::new_robot(&tx.now.clone(), &rollout, &r.robot_id, wave, r.place, r.from_version.clone());
-                let why = (!reason.is_empty()).then(|| Reason::new(Code::RetriedByUser, reason).with("actor", actor));
+                let why = (!reason.is_empty()).then(|| Reason::new(Code::RetriedByPerson, reason).with("actor", actor));
                 tx.put_row(RolloutRobot { again: true, why, ..fresh }, "robot.retried");
             }
         });

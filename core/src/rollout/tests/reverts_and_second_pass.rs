@@ -95,7 +95,7 @@ fn failed_and_skipped_robots_are_retried_one_by_one_and_their_quarantine_is_lift
     assert_eq!(rig.step(n), Step::RolledBack);
     assert_eq!(rig.ota.quarantines.len(), 1);
     rig.must("ro", Verb::RetryFailed);
-    assert_eq!(rig.robot_in("ro", n).why.map(|w| (w.code, w.message)), Some((Code::RetriedByUser, "because".into())));
+    assert_eq!(rig.robot_in("ro", n).why.map(|w| (w.code, w.message)), Some((Code::RetriedByPerson, "because".into())));
     assert!(rig.ota.quarantines.is_empty());
     rig.until(100, |r| r.step(n) == Step::Committed);
     assert_eq!(rig.robots[n].version, "2.0.0");

@@ -159,7 +159,7 @@ async fn an_attempt_is_told_as_its_robot_answers_works_is_stopped_and_driven_by_
     w.resume("r1").await;
     w.r("r1").set_mode(Mode::Manual);
     w.pass(3).await;
-    assert_eq!(of_both(&w, "T1", "r1").await, pair("MANUAL_MODE", "a person at robot r1"));
+    assert_eq!(of_both(&w, "T1", "r1").await, pair("ROBOT_MANUAL", "a person at robot r1"));
     w.r("r1").set_mode(Mode::Automatic);
     w.pass(3).await;
     w.r("r1").cut();
@@ -181,7 +181,7 @@ async fn a_task_that_ended_is_told_with_how_and_when_and_by_whom() {
     w.pass(2).await;
     let told = of_task(&w, "T1").await;
     assert_eq!((told.code.as_str(), told.metadata["state"].as_str()), ("TASK_ENDED", "CANCELED"));
-    assert_eq!(told.metadata["cause"], "CANCELED_BY_USER");
+    assert_eq!(told.metadata["cause"], "CANCELED_BY_PERSON");
     assert!(!told.metadata["end_time"].is_empty() && told.metadata.contains_key("actor"), "{told:?}");
 }
 

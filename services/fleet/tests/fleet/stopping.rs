@@ -14,7 +14,7 @@ async fn a_waiting_task_is_canceled_at_once() {
     w.submit("T1", "A", "B").await;
     w.cancel("T1", false).await;
     let seen = w.until_phase("T1", Phase::Canceled).await;
-    assert_eq!((seen.reason("T1"), seen.task("T1").epoch), (Some(Code::CanceledByUser), 0));
+    assert_eq!((seen.reason("T1"), seen.task("T1").epoch), (Some(Code::CanceledByPerson), 0));
     w.lawful().await;
 }
 
@@ -113,7 +113,7 @@ async fn a_canceled_task_whose_robot_comes_back_from_the_unknown_is_still_cancel
     let mut w = canceled_while_nobody_knew().await;
     w.connect("r1").await;
     let seen = w.until_phase("T1", Phase::Canceled).await;
-    assert_eq!(seen.reason("T1"), Some(Code::CanceledByUser));
+    assert_eq!(seen.reason("T1"), Some(Code::CanceledByPerson));
     w.lawful().await;
 }
 

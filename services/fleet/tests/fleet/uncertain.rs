@@ -70,7 +70,7 @@ async fn a_person_who_takes_the_robot_over_makes_its_work_uncertain_and_gives_it
     w.until_phase("T1", Phase::Running).await;
     w.r("r1").set_mode(Mode::Manual);
     let seen = w.until("nobody knows", |s| s.is_uncertain("T1")).await;
-    assert_eq!(seen.attempt("T1").uncertain.map(|u| u.cause.code), Some(Code::ManualMode));
+    assert_eq!(seen.attempt("T1").uncertain.map(|u| u.cause.code), Some(Code::RobotManual));
     w.submit("T2", "A", "B").await;
     w.pass_while(60, "a person drives", |s| s.is_uncertain("T1") && s.phase("T2") == Phase::Queued).await;
     w.r("r1").set_mode(Mode::Automatic);
