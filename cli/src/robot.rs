@@ -279,7 +279,7 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
             let settled = command!(one, guarded, settle_robot_load, SettleRobotLoadRequest { reason });
             let settled = settled.map_err(Exit::with_facts)?;
             show(&settled, out)?;
-            if settled.load_settled.is_some_and(|word| word.is_told) {
+            if settled.load_settled.is_some_and(|word| word.is_forget_pending) {
                 // It says within a heartbeat or two that it has forgotten it.
                 out.next(&format!("midshift robot get {}", one.robot_id));
             }
@@ -331,7 +331,7 @@ fn control_line(control: &fleet::RobotControl) -> String {
         format!("  held by {}", few(control.hold_tokens.clone()).join(" "))
     };
     let by_word = |word: &fleet::LoadSettled| {
-        let is_empty = if word.is_told { "is told that it carries nothing" } else { "carries nothing" };
+        let is_empty = if word.is_forget_pending { "is told that it carries nothing" } else { "carries nothing" };
         format!("  {is_empty}, says {} ({})", plain(&word.actor), plain(&word.reason))
     };
     let load = control.load_settled.as_ref().map(by_word).unwrap_or_default();

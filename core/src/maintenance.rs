@@ -27,7 +27,7 @@ pub struct DrainRequest {
     pub urgent: bool,
     /// The robot leaves aborted software. Its drain waits only for other drains that end without a person.
     #[serde(default)]
-    pub returns: bool,
+    pub is_way_back: bool,
     /// The robot changes to something new: while the area's window is shut or the area is frozen its drain does not begin.
     #[serde(default)]
     pub forward: bool,

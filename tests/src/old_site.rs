@@ -209,7 +209,7 @@ impl OldSite {
             refusal: None,
             stats: WorkStats::default(),
             software: "1.0.0".to_owned(),
-            been: None,
+            visited: None,
         }
     }
 
@@ -309,7 +309,7 @@ fn completed(rollout_id: &RolloutId, bundle: &BundleId, act: Act) -> Rollout {
         in_flight: 0,
         soak: None,
         exposure: None,
-        sizes: Vec::new(),
+        wave_sizes: Vec::new(),
         promoted: 3,
         verdicts: Vec::new(),
         abort: None,
@@ -335,7 +335,7 @@ fn committed(rollout_id: &RolloutId, robot_id: RobotId, place: u64, at: Utc) -> 
         rollout_id: rollout_id.clone(),
         robot_id,
         wave: 2,
-        place,
+        rank: place,
         step: Step::Committed,
         since: at,
         from_version: String::new(),

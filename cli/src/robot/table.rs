@@ -44,7 +44,8 @@ pub fn row(robot: &v1::Robot, control: Option<&fleet::RobotControl>, now: Option
     let battery_permille = last.map_or(vitals.battery_permille, |last| last.battery_permille);
     let charging = if vitals.charging { " +" } else { "" };
     let battery = format!("{:.0} %{charging}", f64::from(battery_permille) / 10.0);
-    let is_empty = control.and_then(|control| control.load_settled.as_ref()).is_some_and(|word| !word.is_told);
+    let is_empty =
+        control.and_then(|control| control.load_settled.as_ref()).is_some_and(|word| !word.is_forget_pending);
     let load = reported.load.as_ref().filter(|_| !is_empty).map(|l| l.item.clone());
     let age_ms = robot.age.as_ref().or(last.and_then(|last| last.age.as_ref())).map(ms_of);
     vec![
@@ -270,7 +271,7 @@ mod tests {
         assert_eq!(cell(&row(&robot, None, None), "LOAD"), "(crate)");
         let control = fleet::RobotControl { load_settled: Some(fleet::LoadSettled::default()), ..Default::default() };
         assert_eq!(cell(&row(&robot, Some(&control), None), "LOAD"), "");
-        let told = fleet::LoadSettled { is_told: true, ..fleet::LoadSettled::default() };
+        let told = fleet::LoadSettled { is_forget_pending: true, ..fleet::LoadSettled::default() };
         let control = fleet::RobotControl { load_settled: Some(told), ..Default::default() };
         assert_eq!(cell(&row(&robot, Some(&control), None), "LOAD"), "(crate)", "it has not forgotten it yet");
     }

@@ -266,7 +266,7 @@ codes! {
         => "Bring it back into reach. If it will not come, say so with `midshift rollout lost`: until it is heard it counts in no budget then, and keeps its drain.";
     BlockedByWave = "WAITING_FOR_WAVE", "Its wave has not begun."
         => "It begins once the wave before is kept; `midshift rollout get` shows what that one does.";
-    BlockedByPlaceInWave = "WAITING_FOR_PLACE_IN_WAVE", "As many robots as the roll-out allows are out of work for it."
+    BlockedByTurnInWave = "WAITING_FOR_TURN_IN_WAVE", "As many robots as the roll-out allows are out of work for it."
         => "It goes on once one of them is decided.";
     BlockedByPause = "ROLLOUT_PAUSED", "The roll-out stands still."
         => "Resume it.";

@@ -135,7 +135,7 @@ fn add_newcomers(view: &mut RolloutProjection, now: Now, board: &Board, plan: &m
     }
 }
 
-/// Ids of robots' rows that something may be due for, by roll-out, wave and place.
+/// Ids of robots' rows that something may be due for, by roll-out, wave and rank.
 fn due_robots(view: &RolloutProjection) -> Vec<String> {
     let mut ids = view.open.clone();
     let whole = |r: &&Rollout| {
@@ -151,7 +151,7 @@ fn due_robots(view: &RolloutProjection) -> Vec<String> {
     ids.extend(view.waiting_out.iter().filter(applies).cloned());
     let mut ids: Vec<String> = ids.into_iter().collect();
     let order = |id: &String| {
-        view.robots.get(id).map(|r| (r.row.rollout_id.clone(), r.row.failure.is_none(), r.row.wave, r.row.place))
+        view.robots.get(id).map(|r| (r.row.rollout_id.clone(), r.row.failure.is_none(), r.row.wave, r.row.rank))
     };
     ids.sort_by_cached_key(order);
     ids

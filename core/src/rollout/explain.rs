@@ -66,7 +66,7 @@ fn name_robots(view: &RolloutProjection, board: &Board, now: &Now, rollout: &Rol
             let area = by.metadata.get("area_id").and_then(|area| view.budgets.get(area));
             area.map(|area| area.row.off_work.iter().collect()).unwrap_or_default()
         }
-        Code::BlockedByPlaceInWave => {
+        Code::BlockedByTurnInWave => {
             view.robots_of(&rollout.rollout_id).filter(of_rollout).map(|r| &r.robot_id).collect()
         }
         _ => return by,

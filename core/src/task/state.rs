@@ -264,7 +264,7 @@ pub struct Been {
     pub resume_step: u32,
     /// A part of what the robot said meanwhile is lost.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub is_broken: bool,
+    pub is_incomplete: bool,
 }
 
 /// One grant of a task or errand to one robot.
@@ -308,7 +308,7 @@ pub struct Attempt {
     pub software: String,
     /// Where the robot was while it had it. None: it is an errand, an older version began it, or a part of it was lost or cannot be compared.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub been: Option<Been>,
+    pub visited: Option<Been>,
 }
 
 impl Attempt {

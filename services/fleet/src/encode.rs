@@ -54,7 +54,7 @@ pub fn control(view: &FleetProjection, board: &Board, robot_id: &RobotId) -> v1:
             reason: word.reason.clone(),
             since: Some(timestamp(word.since)),
             actor: word.actor.clone(),
-            is_told: word.is_told,
+            is_forget_pending: word.is_forget_pending,
         }),
         labels: row.labels,
         etag: etag(rowed.map_or(Revision(0), |c| c.revision)),

@@ -367,7 +367,7 @@ impl Changes {
 
 /// Robots that may change at once in the wave that a roll-out is in, counted from what was asked for.
 fn most_of(row: &Rollout) -> usize {
-    let all: usize = row.sizes.iter().map(|size| *size as usize).sum();
+    let all: usize = row.wave_sizes.iter().map(|size| *size as usize).sum();
     let asked = match row.spec.waves.get(row.wave as usize) {
         Some(Wave::Count(count)) => *count as usize,
         Some(Wave::Percent(percent)) => (all * *percent as usize).div_ceil(100),

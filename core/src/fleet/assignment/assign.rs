@@ -85,8 +85,8 @@ fn offer(tx: &mut Tx, task: &TaskState, intake: &TaskIntake, robot_id: &RobotId,
     tx.put_row(granted, "task.granted");
     let mut record = attempts::fresh_attempt(tx, attempt, robot_id, anchor);
     record.step_index = task.next_step;
-    if let Some(been) = &mut record.been {
-        been.resume_step = task.next_step;
+    if let Some(visited) = &mut record.visited {
+        visited.resume_step = task.next_step;
     }
     record.opened = task.opened.is_some();
     attempts::take_robot(tx, &record);

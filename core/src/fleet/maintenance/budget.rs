@@ -143,8 +143,8 @@ fn put_row(tx: &mut Tx, area_id: &AreaId, area: &Area) {
 }
 
 fn row_of(view: &FleetProjection, area_id: &AreaId, area: &Area) -> AreaBudget {
-    let most = view.policy(area_id).software.off_work_max(area.robots.len()) as u32;
-    AreaBudget { area_id: area_id.clone(), off_work: area.off_work.clone(), most }
+    let off_work_max = view.policy(area_id).software.off_work_max(area.robots.len()) as u32;
+    AreaBudget { area_id: area_id.clone(), off_work: area.off_work.clone(), off_work_max }
 }
 
 /// Rows of areas whose robots came back, or were taken out by a person or the breaker.
@@ -238,7 +238,7 @@ fn refusal(
         return None;
     }
     let rules = view.policy(area_id).software;
-    let off = if drain.returns { area.draining.len() } else { area.off_work.len() };
+    let off = if drain.is_way_back { area.draining.len() } else { area.off_work.len() };
     let most = rules.off_work_max(area.robots.len());
     let budget = || Reason::from(Code::BlockedByBudget).with("area_id", area_id);
     if off >= most {

@@ -47,7 +47,7 @@ pub fn ask(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str, within_ms
         area_id: None,
         rollout_id: None,
         urgent: true,
-        returns: false,
+        is_way_back: false,
     };
     tx.put_row(drain, "drain.asked");
 }
@@ -106,7 +106,7 @@ pub fn apply_requests(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
                 area_id: None,
                 rollout_id: Some(request.rollout_id),
                 urgent: request.urgent,
-                returns: request.returns,
+                is_way_back: request.is_way_back,
             };
             tx.put_row(drain, "drain.asked");
         });

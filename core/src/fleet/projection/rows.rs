@@ -142,9 +142,10 @@ pub struct LoadSettled {
     pub session_epoch: u64,
     /// Its number; the highest there is: of all of that session.
     pub hb: u64,
-    /// The robot was heard and said by its memory that it carries something: it is told, and counts as loaded until it says otherwise.
+    /// The robot is told to forget its load, and has not yet: it was heard, knew its load by memory alone, and counts as loaded
+    /// until it says otherwise.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub is_told: bool,
+    pub is_forget_pending: bool,
 }
 
 /// What people and the breaker decided about a robot.
@@ -501,7 +502,7 @@ pub struct Drain {
     pub urgent: bool,
     /// The robot goes back from what was aborted: only drains that are on count against it.
     #[serde(default)]
-    pub returns: bool,
+    pub is_way_back: bool,
 }
 
 impl Drain {
@@ -523,7 +524,7 @@ pub struct AreaBudget {
     /// Out of work for a drain, a cordon or the breaker; one that is out for several reasons stands here once.
     pub off_work: BTreeSet<RobotId>,
     /// As many may be.
-    pub most: u32,
+    pub off_work_max: u32,
 }
 
 impl Record for AreaBudget {

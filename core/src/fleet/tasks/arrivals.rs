@@ -55,7 +55,7 @@ pub fn note_standing(tx: &mut Tx, live: &Live) {
 /// Notes the place if one of the steps of the robot's attempt up to `last` ends there.
 fn note_until(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, last: u32) {
     let Some(a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)) else { return };
-    let is_known = a.been.as_ref().is_none_or(|been| been.places.contains(place_id));
+    let is_known = a.visited.as_ref().is_none_or(|visited| visited.places.contains(place_id));
     let Some(intake) = a.attempt.subject.task_id().filter(|_| !is_known).and_then(|id| tx.view.intake(id)) else {
         return;
     };
@@ -64,8 +64,8 @@ fn note_until(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, last: u32) {
         return;
     }
     let mut a = a.clone();
-    if let Some(been) = &mut a.been {
-        been.places.insert(place_id.clone());
+    if let Some(visited) = &mut a.visited {
+        visited.places.insert(place_id.clone());
     }
     tx.put_row(a, "attempt.changed");
 }
@@ -73,22 +73,22 @@ fn note_until(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, last: u32) {
 /// Something that the robot said is lost: of its attempt nobody can tell any more where it was until now.
 pub fn lost(tx: &mut Tx, robot_id: &RobotId) {
     let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
-    if let Some(been) = a.been.as_mut().filter(|been| !been.is_broken) {
-        been.is_broken = true;
+    if let Some(visited) = a.visited.as_mut().filter(|visited| !visited.is_incomplete) {
+        visited.is_incomplete = true;
         tx.put_row(a, "attempt.changed");
     }
 }
 
 fn lose(tx: &mut Tx, id: &AttemptId) {
-    if let Some(a) = tx.view.attempt(id).filter(|a| a.been.is_some()) {
-        let unknown = Attempt { been: None, ..a.clone() };
+    if let Some(a) = tx.view.attempt(id).filter(|a| a.visited.is_some()) {
+        let unknown = Attempt { visited: None, ..a.clone() };
         tx.put_row(unknown, "attempt.changed");
     }
 }
 
 /// The map has changed: where robots were by the one before tells nothing of this one.
 pub(in crate::fleet) fn forget(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
-    let noted = view.attempts.values().map(|a| &a.row).filter(|a| a.been.is_some() && may_end(a));
+    let noted = view.attempts.values().map(|a| &a.row).filter(|a| a.visited.is_some() && may_end(a));
     let noted: Vec<AttemptId> = noted.map(|a| a.attempt.clone()).collect();
     for id in &noted {
         plan.decide(view, now, "fleet", |tx| lose(tx, id));
@@ -133,15 +133,15 @@ pub(in crate::fleet) fn proven(
 
 /// The first drive of the attempt among the first `claimed` steps that ends where its robot was not seen.
 fn unproven(view: &FleetProjection, now: &Now, a: &Attempt, claimed: u32, is_success: bool) -> Option<(u32, PlaceId)> {
-    let been = a.been.as_ref().filter(|_| !view.bugs.success_is_believed())?;
+    let visited = a.visited.as_ref().filter(|_| !view.bugs.success_is_believed())?;
     let steps = &view.intake(a.attempt.subject.task_id()?)?.spec.steps;
-    let begun = (is_success || claimed > been.resume_step).then(|| from_step(steps, been.resume_step));
-    let is_due = |step: u32| (been.resume_step..claimed).contains(&step) || begun == Some(step);
+    let begun = (is_success || claimed > visited.resume_step).then(|| from_step(steps, visited.resume_step));
+    let is_due = |step: u32| (visited.resume_step..claimed).contains(&step) || begun == Some(step);
     let drives = (0..).zip(steps).filter(|(step, what)| is_due(*step) && matches!(what.kind, StepKind::Goto { .. }));
     let mut drives: Vec<(u32, &WorkStep)> = drives.collect();
     let first = drives.first().map(|(step, _)| *step);
     let ring = &view.sessions.get(a.robot_id.as_str())?.row.ring;
-    if been.is_broken || *ring != been.ring {
+    if visited.is_incomplete || *ring != visited.ring {
         let kept = if is_success { 1 } else { 0 };
         drives.drain(..drives.len().saturating_sub(kept));
     }
@@ -150,7 +150,7 @@ fn unproven(view: &FleetProjection, now: &Now, a: &Attempt, claimed: u32, is_suc
     let began_at = given.and_then(|given| given.route.first()?.standing.as_ref());
     let is_unseen = |step: u32, place: &PlaceId| {
         let stood_there = Some(step) == first && began_at == Some(place);
-        !stood_there && !been.places.contains(place) && is_elsewhere(view, &a.robot_id, place)
+        !stood_there && !visited.places.contains(place) && is_elsewhere(view, &a.robot_id, place)
     };
     let owed = drives.into_iter().filter(|(_, what)| !what.continue_on_fail);
     let mut goals = owed.filter_map(|(step, what)| Some((step, goal(&view.site, what)?)));

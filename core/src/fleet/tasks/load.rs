@@ -26,7 +26,7 @@ pub fn carried<'l>(view: &FleetProjection, live: &'l Live) -> Option<&'l Load> {
 
 /// A person's word that holds: the robot was not heard then, and has said nothing newer.
 fn settled<'v>(view: &'v FleetProjection, robot_id: &RobotId, live: Option<&Live>) -> Option<&'v LoadSettled> {
-    let word = view.control.get(robot_id.as_str())?.row.load_settled.as_ref().filter(|word| !word.is_told)?;
+    let word = view.control.get(robot_id.as_str())?.row.load_settled.as_ref().filter(|word| !word.is_forget_pending)?;
     let is_newer = |live: &Live| (live.report.session_epoch, live.report.hb) > (word.session_epoch, word.hb);
     (!live.is_some_and(is_newer)).then_some(word)
 }
@@ -37,7 +37,7 @@ pub fn standing_word<'v>(
     robot_id: &RobotId,
     live: Option<&Live>,
 ) -> Option<&'v LoadSettled> {
-    let told = || view.control.get(robot_id.as_str())?.row.load_settled.as_ref().filter(|word| word.is_told);
+    let told = || view.control.get(robot_id.as_str())?.row.load_settled.as_ref().filter(|word| word.is_forget_pending);
     settled(view, robot_id, live).or_else(told)
 }
 
@@ -131,7 +131,7 @@ pub(in crate::fleet) fn settle(tx: &Tx, board: &Board, robot_id: &RobotId, reaso
         since: tx.now.utc,
         session_epoch,
         hb,
-        is_told: is_heard && live.is_some_and(|live| live.report.load.is_some()),
+        is_forget_pending: is_heard && live.is_some_and(|live| live.report.load.is_some()),
     }
 }
 
@@ -139,7 +139,7 @@ pub(in crate::fleet) fn settle(tx: &Tx, board: &Board, robot_id: &RobotId, reaso
 /// With a person's drain somebody comes to it, who waits only for a task that goes on.
 pub fn must_deliver(view: &FleetProjection, drain: &Drain, live: Option<&Live>) -> bool {
     let loaded = live.is_some_and(|live| carried(view, live).is_some());
-    loaded && !drain.returns && (!drain.is_of_person() || goes_on(view, live))
+    loaded && !drain.is_way_back && (!drain.is_of_person() || goes_on(view, live))
 }
 
 /// The task whose item the robot carries is tried again by itself, on this robot.

@@ -209,7 +209,7 @@ type Excuse<'a> = &'a dyn Fn(&mut Rig);
 fn what_nobody_can_tell_is_believed() {
     let older_version = |rig: &mut Rig| {
         let id = attempt(rig).to_string();
-        rig.view.attempts.get_mut(&id).expect("an attempt").row.been = None;
+        rig.view.attempts.get_mut(&id).expect("an attempt").row.visited = None;
     };
     let restored = |rig: &mut Rig| {
         Plan::default().decide(&mut rig.view, rig.now, "fleet", |tx| claims::outran(tx, &robot_id(), 9, false));
@@ -308,7 +308,7 @@ fn an_attempt_owes_nothing_of_the_steps_that_one_before_it_did() {
     let mut rig = given();
     let id = attempt(&rig).to_string();
     let row = &mut rig.view.attempts.get_mut(&id).expect("an attempt").row;
-    row.been.as_mut().expect("its notes").resume_step = 2;
+    row.visited.as_mut().expect("its notes").resume_step = 2;
     row.phase = AttemptPhase::Lost;
     rig.view.desired_work.get_mut("r1").expect("its work").row.assignment = None;
     // A person put the item back meanwhile.

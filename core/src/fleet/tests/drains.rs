@@ -39,7 +39,7 @@ fn drains_that_are_asked_for_and_let_go_all_at_once_are_decided_in_slices() {
             reason: "new software".to_owned(),
             within_ms: 600_000,
             urgent: false,
-            returns: false,
+            is_way_back: false,
             forward: false,
             written_off: false,
         });

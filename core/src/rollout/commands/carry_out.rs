@@ -178,7 +178,7 @@ fn draft(tx: &Tx, rollout_id: &RolloutId, spec: Arc<RolloutSpec>, actor: &Actor)
         in_flight: 0,
         soak: None,
         exposure: None,
-        sizes: Vec::new(),
+        wave_sizes: Vec::new(),
         promoted: 0,
         verdicts: Vec::new(),
         abort: None,
@@ -288,7 +288,7 @@ fn start(
             phase,
             started,
             since,
-            sizes: sizes.clone(),
+            wave_sizes: sizes.clone(),
             supersedes: others.clone(),
             counted,
             ..rollout.clone()
@@ -316,7 +316,7 @@ fn retry_failed(view: &mut RolloutProjection, now: Now, id: &RolloutId, actor: &
                 let key = Quarantine::id_of(&r.robot_id, &rollout.spec.bundle);
                 tx.delete::<Quarantine>(&key, "quarantine.lifted");
                 let fresh =
-                    assign::new_robot(&tx.now.clone(), &rollout, &r.robot_id, wave, r.place, r.from_version.clone());
+                    assign::new_robot(&tx.now.clone(), &rollout, &r.robot_id, wave, r.rank, r.from_version.clone());
                 let why = (!reason.is_empty()).then(|| Reason::new(Code::RetriedByPerson, reason).with("actor", actor));
                 tx.put_row(RolloutRobot { again: true, why, ..fresh }, "robot.retried");
             }

@@ -10,9 +10,9 @@ use crate::time::{Now, Utc};
 
 /// Gives robots their rows.
 pub fn assign_robots(tx: &mut Tx, rollout: &Rollout, robots: &[(RobotId, u32, u64, String)]) {
-    for (robot_id, wave, place, from_version) in robots {
+    for (robot_id, wave, rank, from_version) in robots {
         let now = tx.now;
-        tx.put_row(new_robot(&now, rollout, robot_id, *wave, *place, from_version.clone()), "robot.assigned");
+        tx.put_row(new_robot(&now, rollout, robot_id, *wave, *rank, from_version.clone()), "robot.assigned");
     }
 }
 
@@ -22,14 +22,14 @@ pub fn new_robot(
     rollout: &Rollout,
     robot_id: &RobotId,
     wave: u32,
-    place: u64,
+    rank: u64,
     from_version: String,
 ) -> RolloutRobot {
     RolloutRobot {
         rollout_id: rollout.rollout_id.clone(),
         robot_id: robot_id.clone(),
         wave,
-        place,
+        rank,
         step: Step::Waiting,
         since: now.utc,
         from_version,

@@ -1,6 +1,6 @@
 //! Whom a roll-out would reach, who is left out and why, and in which wave each comes.
 //!
-//! Called by the dry run and by the start, which therefore never differ. Invariant: the place of a robot depends on the
+//! Called by the dry run and by the start, which therefore never differ. Invariant: the rank of a robot depends on the
 //! roll-out's id and its own, never on the order in which robots came.
 
 use crate::fleet::Board;
@@ -20,8 +20,8 @@ pub struct Matched {
     pub robot_id: RobotId,
     /// Its wave, from 0.
     pub wave: u32,
-    /// Its place within the wave.
-    pub place: u64,
+    /// Its rank within the wave: robots with a lower one come first.
+    pub rank: u64,
     /// What is alike about it.
     pub stratum: Stratum,
 }
@@ -42,7 +42,7 @@ pub struct Stratum {
 /// Whom a roll-out would reach.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Matching {
-    /// By wave and place.
+    /// By wave and rank.
     pub robots: Vec<Matched>,
     /// Robots that were selected and are left out, and why.
     pub left_out: BTreeMap<RobotId, Reason>,
@@ -92,7 +92,7 @@ pub fn match_robots(
             continue;
         };
         match may_have(view, robot_id, &stratum, bundle) {
-            Ok(()) => found.push((place_of(id, robot_id), robot_id.clone(), stratum)),
+            Ok(()) => found.push((rank_of(id, robot_id), robot_id.clone(), stratum)),
             Err(reason) => {
                 matching.left_out.insert(robot_id.clone(), reason);
             }
@@ -115,10 +115,10 @@ pub fn match_robots(
             });
             if room > 0
                 && belongs
-                && let Some((place, robot_id, stratum)) = slot.take()
+                && let Some((rank, robot_id, stratum)) = slot.take()
             {
                 room -= 1;
-                matching.robots.push(Matched { robot_id, wave, place, stratum });
+                matching.robots.push(Matched { robot_id, wave, rank, stratum });
             }
         }
     }
@@ -189,7 +189,7 @@ pub fn other_key(view: &RolloutProjection, robot_id: &RobotId) -> Option<Reason>
     Some(Reason::from(Code::SkippedOtherKey).with("robot_id", robot_id).with("device_key", key))
 }
 
-/// Robots of a roll-out with wave, place and version they run, and how many each wave has.
+/// Robots of a roll-out with wave, rank and version they run, and how many each wave has.
 pub type Members = (Vec<(RobotId, u32, u64, String)>, Vec<u32>);
 
 /// Whom a roll-out reaches.
@@ -197,11 +197,11 @@ pub fn find_members(view: &RolloutProjection, board: &Board, rollout: &Rollout) 
     if let Some(original) = rollout.revert_of.as_ref().and_then(|of| view.rollout(of)) {
         let kept = view.robots_of(&original.rollout_id).filter(|r| is_kept(view, original, r));
         let member = |r: &RolloutRobot| {
-            let place = place_of(&rollout.rollout_id, &r.robot_id);
-            (r.robot_id.clone(), 0, place, view.software_of(&r.robot_id).version)
+            let rank = rank_of(&rollout.rollout_id, &r.robot_id);
+            (r.robot_id.clone(), 0, rank, view.software_of(&r.robot_id).version)
         };
         let mut kept: Vec<_> = kept.map(member).collect();
-        kept.sort_by_key(|(_, _, place, _)| *place);
+        kept.sort_by_key(|(_, _, rank, _)| *rank);
         let count = kept.len() as u32;
         return (kept, vec![count]);
     }
@@ -209,7 +209,7 @@ pub fn find_members(view: &RolloutProjection, board: &Board, rollout: &Rollout) 
     let matching = match_robots(view, board, &rollout.rollout_id, &rollout.spec, &bundle.row);
     let sizes = matching.sizes(rollout.spec.waves.len());
     let robots = matching.robots.into_iter();
-    (robots.map(|m| (m.robot_id, m.wave, m.place, m.stratum.from_version)).collect(), sizes)
+    (robots.map(|m| (m.robot_id, m.wave, m.rank, m.stratum.from_version)).collect(), sizes)
 }
 
 /// A robot keeps what the roll-out brought, or is about to: a roll-out is completed before the last of its robots has
@@ -252,7 +252,7 @@ pub fn may_have(
 /// Place of a robot in a roll-out: FNV-1a over both ids, so that each roll-out begins with other robots, and then
 /// stirred as the end of MurmurHash3 does: FNV alone leaves robots with neighbouring numbers, which often stand and
 /// work alike, side by side.
-pub fn place_of(rollout: &RolloutId, robot: &RobotId) -> u64 {
+pub fn rank_of(rollout: &RolloutId, robot: &RobotId) -> u64 {
     let bytes = rollout.as_str().bytes().chain([0]).chain(robot.as_str().bytes());
     let fold = |hash: u64, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
     let stir = |hash: u64, by: u64| (hash ^ (hash >> 33)).wrapping_mul(by);

@@ -43,8 +43,8 @@ pub fn stop_serving(tx: &mut Tx, rollout: &Rollout, r: &RolloutRobot) {
 /// Gives a robot that came later a place behind the last wave.
 pub fn add_newcomer(tx: &mut Tx, board: &Board, robot_id: &RobotId, rollout: &Rollout) {
     let wave = rollout.spec.waves.len() as u32 + 1;
-    let place = matching::place_of(&rollout.rollout_id, robot_id);
+    let rank = matching::rank_of(&rollout.rollout_id, robot_id);
     let from_version = matching::stratum_of(tx.view, board, robot_id).map(|s| s.from_version).unwrap_or_default();
-    let row = new_robot(&tx.now, rollout, robot_id, wave, place, from_version);
+    let row = new_robot(&tx.now, rollout, robot_id, wave, rank, from_version);
     tx.put_row(row, "robot.newcomer");
 }

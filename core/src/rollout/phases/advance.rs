@@ -123,7 +123,7 @@ fn assigns_missing(tx: &mut Tx, board: &Board, rollout: &Rollout) -> bool {
     let id = &rollout.rollout_id;
     let waves = (id.clone(), 0)..=(id.clone(), u32::MAX);
     let there: u32 = tx.view.wave_sizes.range(waves).map(|(_, size)| *size).sum();
-    if there >= rollout.sizes.iter().sum() {
+    if there >= rollout.wave_sizes.iter().sum() {
         return false;
     }
     let (mut members, _) = matching::find_members(tx.view, board, rollout);
@@ -132,8 +132,8 @@ fn assigns_missing(tx: &mut Tx, board: &Board, rollout: &Rollout) -> bool {
     if members.is_empty() {
         // The others do not fit any more.
         let size = |wave| tx.view.wave_sizes.get(&(id.clone(), wave)).copied().unwrap_or_default();
-        let sizes = (0..rollout.sizes.len() as u32).map(size).collect();
-        tx.put_row(Rollout { sizes, ..rollout.clone() }, "rollout.sized");
+        let wave_sizes = (0..rollout.wave_sizes.len() as u32).map(size).collect();
+        tx.put_row(Rollout { wave_sizes, ..rollout.clone() }, "rollout.sized");
     }
     assign::assign_robots(tx, rollout, &members);
     true
@@ -185,7 +185,7 @@ fn applying(tx: &mut Tx, board: &Board, rollout: Rollout) {
 /// The next robots of later waves, for those of this wave that were skipped and for whom nobody stood in yet.
 fn find_stand_ins(view: &RolloutProjection, board: &Board, now: &Now, rollout: &Rollout) -> Vec<RolloutRobot> {
     let id = &rollout.rollout_id;
-    let planned = rollout.sizes.get(rollout.wave as usize).copied().unwrap_or_default();
+    let planned = rollout.wave_sizes.get(rollout.wave as usize).copied().unwrap_or_default();
     let there = verdict::robots_of_wave(view, id, rollout.wave).filter(|r| r.step != Step::Skipped).count() as u32;
     let missing = planned.saturating_sub(there) as usize;
     if missing == 0 {
@@ -193,7 +193,7 @@ fn find_stand_ins(view: &RolloutProjection, board: &Board, now: &Now, rollout: &
     }
     let later = view.robots_of(id).filter(|r| r.wave > rollout.wave && !is_newcomer(rollout, r));
     let mut ready: Vec<_> = later.filter(|r| r.step < Step::Draining && !is_offline(view, board, now, r)).collect();
-    ready.sort_by_key(|r| (r.wave, r.place));
+    ready.sort_by_key(|r| (r.wave, r.rank));
     ready.into_iter().take(missing.min(limits::ITEM_ROWS_MAX / 2)).cloned().collect()
 }
 

@@ -254,7 +254,7 @@ impl<'a> Situation<'a> {
         }
         let in_flight = rollout.in_flight;
         let is_full = in_flight >= in_flight_max(view, rollout);
-        is_full.then(|| Reason::from(Code::BlockedByPlaceInWave).with("in_flight", in_flight))
+        is_full.then(|| Reason::from(Code::BlockedByTurnInWave).with("in_flight", in_flight))
     }
 
     /// The area of the robot, if no new drain may begin there.

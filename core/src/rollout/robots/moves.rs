@@ -355,8 +355,8 @@ fn used_grant(view: &RolloutProjection, board: &Board, now: &Now, robot_id: &Rob
 
 fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool) {
     let Ok(drain_id) = DrainId::parse(&format!("ota:{}", next_number(tx, 0))) else { return };
-    let returns = rollout.phase.goes_back();
-    let goal = if returns || rollout.revert_of.is_some() { "goes back from" } else { "changes to" };
+    let is_way_back = rollout.phase.goes_back();
+    let goal = if is_way_back || rollout.revert_of.is_some() { "goes back from" } else { "changes to" };
     let label = tx.view.bundles.get(rollout.spec.bundle.as_str()).map(|b| b.row.label()).unwrap_or_default();
     let request = DrainRequest {
         drain_id: drain_id.clone(),
@@ -365,7 +365,7 @@ fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool)
         reason: format!("{goal} {label}"),
         within_ms: rollout.spec.drain_within_ms,
         urgent,
-        returns,
+        is_way_back,
         forward: rollout.revert_of.is_none() && r.step == Step::Staged,
         written_off: !r.counts(),
     };

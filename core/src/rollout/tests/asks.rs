@@ -29,10 +29,10 @@ impl Rig {
         self.ota.robots.values().filter(|r| r.row.step == step).count()
     }
 
-    /// Robots of roll-out `ro` in order of wave and place.
+    /// Robots of roll-out `ro` in order of wave and rank.
     pub(super) fn order(&self) -> Vec<usize> {
         let mut all: Vec<RolloutRobot> = self.ota.robots_of(&rollout_id("ro")).cloned().collect();
-        all.sort_by_key(|r| (r.wave, r.place));
+        all.sort_by_key(|r| (r.wave, r.rank));
         all.iter().map(|r| r.robot_id.as_str()[1..].parse().expect("a number")).collect()
     }
 

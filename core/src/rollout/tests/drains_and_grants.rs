@@ -145,7 +145,7 @@ fn drains_wait_until_the_area_lets_them_begin_and_the_row_is_in_the_same_item() 
     rig.ticks(8);
     assert_eq!((drains(&rig, DrainState::Held), drains(&rig, DrainState::Waiting)), (2, 10));
     let row: fleet::rows::AreaBudget = rig.row("hall").expect("a row");
-    assert_eq!((row.off_work.len(), row.most), (2, 2));
+    assert_eq!((row.off_work.len(), row.off_work_max), (2, 2));
     let waits = rig.fleet.drains.values().filter(|d| d.row.state == DrainState::Waiting);
     assert!(waits.clone().all(|d| d.row.why.as_ref().is_some_and(|w| w.code == Code::BlockedByBudget)));
     let begun = rig.feed.iter().filter(|e| &*e.kind == "drain.begun");
@@ -226,11 +226,11 @@ fn whoever_goes_back_from_an_aborted_bundle_does_not_wait_for_robots_that_only_a
     let is_on = |rig: &Rig, n: usize| rig.fleet.drains[&format!("ota:{n}")].row.is_on();
     assert_eq!([0, 1].map(|n| is_on(&rig, n)), [false, false], "one may be out of work, and one is");
     for n in [3, 4] {
-        rig.put_row(crate::maintenance::DrainRequest { returns: true, ..request(n, false) });
+        rig.put_row(crate::maintenance::DrainRequest { is_way_back: true, ..request(n, false) });
     }
     rig.put_row(crate::maintenance::DrainRequest {
         drain_id: DrainId::parse("ota:8").expect("an id"),
-        returns: true,
+        is_way_back: true,
         ..request(0, false)
     });
     rig.fleet_turn();
@@ -321,7 +321,7 @@ fn a_load_keeps_nobody_from_going_back_nor_from_a_person_who_asked_for_the_robot
     let mut plan = fleet::Plan::default();
     plan.decide(&mut rig.fleet, rig.now, "ana", |tx| drain::ask(tx, &robot_id(0), "oil", "ana", 60_000));
     rig.commit(plan.items);
-    rig.put_row(crate::maintenance::DrainRequest { returns: true, ..request(1, false) });
+    rig.put_row(crate::maintenance::DrainRequest { is_way_back: true, ..request(1, false) });
     rig.ticks(3);
     let states: Vec<_> = rig.fleet.drains.values().map(|d| d.row.state).collect();
     assert_eq!(states, [DrainState::Held, DrainState::Held]);
@@ -335,7 +335,7 @@ fn request(n: usize, urgent: bool) -> crate::maintenance::DrainRequest {
         reason: String::new(),
         within_ms: 60_000,
         urgent,
-        returns: false,
+        is_way_back: false,
         forward: false,
         written_off: false,
     }
@@ -360,7 +360,7 @@ fn charge(id: &crate::ids::AttemptId, errand: crate::task::state::Errand) -> cra
         refusal: None,
         stats: WorkStats::default(),
         software: String::new(),
-        been: None,
+        visited: None,
     }
 }
 

@@ -114,6 +114,6 @@ fn who_holds_the_place_in_a_wave_is_named_too() {
     let (mut rig, first) = silent(|s| s.max_in_flight = Some(1));
     rig.ticks(2);
     let by = waits(&rig, (first + 1) % 12).by;
-    assert_eq!(by.code, Code::BlockedByPlaceInWave);
+    assert_eq!(by.code, Code::BlockedByTurnInWave);
     assert_eq!(by.metadata.get("held_by"), Some(&robot_id(first).to_string()));
 }

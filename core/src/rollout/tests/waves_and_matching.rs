@@ -38,7 +38,7 @@ fn the_order_comes_of_both_ids_and_not_of_who_came_first() {
     assert_eq!(order("ro"), order("ro"));
     assert_ne!(order("ro"), order("other"));
     let mut by_hash: Vec<RobotId> = (0..10).map(robot_id).collect();
-    by_hash.sort_by_key(|r| matching::place_of(&rollout_id("ro"), r));
+    by_hash.sort_by_key(|r| matching::rank_of(&rollout_id("ro"), r));
     assert_eq!(order("ro"), by_hash);
 }
 
@@ -46,7 +46,7 @@ fn the_order_comes_of_both_ids_and_not_of_who_came_first() {
 fn robots_with_neighbouring_numbers_do_not_stand_side_by_side() {
     for rollout in ["ro", "base-2.0.0", "x"] {
         let mut by_place: Vec<usize> = (0..100).collect();
-        by_place.sort_by_key(|n| matching::place_of(&rollout_id(rollout), &robot_id(*n)));
+        by_place.sort_by_key(|n| matching::rank_of(&rollout_id(rollout), &robot_id(*n)));
         let side_by_side = by_place.windows(2).filter(|pair| pair[0].abs_diff(pair[1]) == 1).count();
         assert!(side_by_side < 10, "{rollout}: {side_by_side} pairs, chance has 2");
         assert!(by_place[..10].iter().map(|n| n / 10).collect::<BTreeSet<_>>().len() > 3, "{rollout}");

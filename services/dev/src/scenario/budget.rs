@@ -236,7 +236,7 @@ impl Judge {
     /// A robot that goes back from what was aborted waits for drains alone that end by themselves. An urgent one waits for nobody, and counts.
     fn area_allows(&mut self, drain: &Drain) {
         let Some(area_id) = &drain.area_id else { return };
-        let waited_for = |d: &Drain| !self.is_written_off(d) && (!drain.returns || self.comes_back(&d.robot_id));
+        let waited_for = |d: &Drain| !self.is_written_off(d) && (!drain.is_way_back || self.comes_back(&d.robot_id));
         let counts = |d: &&Drain| d.drain_id == drain.drain_id || waited_for(d);
         let taken_here = self.on.values().filter(|d| d.area_id.as_ref() == Some(area_id));
         let out: BTreeSet<&RobotId> = taken_here.filter(counts).map(|d| &d.robot_id).collect();
@@ -254,7 +254,7 @@ impl Judge {
 
     /// Never more robots are out of work for a roll-out than its wave has, or than it was asked for.
     fn rollout_allows(&mut self, drain: &Drain) {
-        let waits = |d: &Drain| !d.returns && !d.urgent;
+        let waits = |d: &Drain| !d.is_way_back && !d.urgent;
         let Some((id, pace)) = drain.rollout_id.as_ref().and_then(|id| self.rollouts.get_key_value(id)) else { return };
         if !waits(drain) {
             return;

@@ -61,8 +61,8 @@ async fn an_honest_robot_whose_server_starts_anew_on_its_way_is_believed() {
     w.stop_fleet().await;
     w.start_fleet();
     let seen = w.until_phase("T1", Phase::Succeeded).await;
-    let been = seen.attempt("T1").been.expect("it was told whole").places;
-    assert_eq!(been.iter().map(ToString::to_string).collect::<Vec<_>>(), ["A", "B"]);
+    let visited = seen.attempt("T1").visited.expect("it was told whole").places;
+    assert_eq!(visited.iter().map(ToString::to_string).collect::<Vec<_>>(), ["A", "B"]);
     assert_eq!(seen.open_incidents(CODE).len(), 0);
     w.lawful().await;
 }

@@ -101,7 +101,7 @@ async fn a_load_that_a_robot_only_remembers_is_settled_by_a_persons_word_while_i
     w.pass_while(10, "its hand is full, it thinks", |s| s.phase("T1") == Phase::Queued).await;
     w.r("r1").hears = false;
     let told = settle(&w).await.expect("it is told").load_settled.expect("a word");
-    assert!(told.is_told);
+    assert!(told.is_forget_pending);
     w.pass_while(10, "it has not heard of it", |s| s.phase("T1") == Phase::Queued && s.task("T1").opened.is_none())
         .await;
     let seen = w.seen().await;

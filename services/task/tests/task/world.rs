@@ -241,7 +241,7 @@ pub fn attempt(task_id: &TaskId, epoch: u64, phase: AttemptPhase) -> Attempt {
         refusal: None,
         stats: Default::default(),
         software: String::new(),
-        been: None,
+        visited: None,
     }
 }
 

@@ -144,8 +144,8 @@ pub struct RolloutRobot {
     pub robot_id: RobotId,
     /// Its wave, from 0. The number of waves: it came after the roll-out was completed.
     pub wave: u32,
-    /// Its place within the wave.
-    pub place: u64,
+    /// Its rank within the wave: robots with a lower one come first.
+    pub rank: u64,
     /// How far it is.
     pub step: Step,
     /// Since when, UTC, site clock.

@@ -322,7 +322,7 @@ pub struct Rollout {
     /// Work of the wave is waited for until then.
     pub exposure: Option<Countdown>,
     /// Robots that each wave was to have when it began.
-    pub sizes: Vec<u32>,
+    pub wave_sizes: Vec<u32>,
     /// Waves that are kept, from the first.
     pub promoted: u32,
     /// Verdicts so far.

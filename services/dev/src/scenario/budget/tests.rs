@@ -45,7 +45,7 @@ fn drain(number: usize, from: &str) -> Drain {
         area_id: Some(area(from)),
         rollout_id: Some(rollout()),
         urgent: false,
-        returns: false,
+        is_way_back: false,
     }
 }
 
@@ -136,7 +136,7 @@ fn robots_that_left_an_area_a_while_ago_are_no_budget_of_it() {
 
 #[test]
 fn a_way_back_waits_for_drains_alone_that_end_by_themselves_and_an_urgent_one_for_nobody() {
-    let back = |number| Drain { returns: true, ..drain(number, "packing") };
+    let back = |number| Drain { is_way_back: true, ..drain(number, "packing") };
     let mut waits = judge();
     waits.drain(drain(20, "packing"));
     waits.drain(back(21));
