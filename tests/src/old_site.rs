@@ -201,7 +201,7 @@ impl OldSite {
             offer: Authority { session_epoch: 1, hb: 1, valid_ms: 30_000 },
             step_index: state.next_step,
             reported: None,
-            opened: is_good,
+            is_opened: is_good,
             offered: Utc(at.0 - 60_000),
             accepted: Some(Utc(at.0 - 59_000)),
             ended: Some(at),

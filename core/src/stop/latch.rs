@@ -24,7 +24,7 @@ pub struct Stop {
     /// What they do. Never [`StopLevel::None`].
     pub level: StopLevel,
     /// When, UTC of the stop service's wall. For people, and for how long names are remembered.
-    pub engaged: Utc,
+    pub engaged_unix_ms: Utc,
     /// The actor that engaged it, by name.
     pub actor: String,
     /// Why, in a person's words, at most [`limits::REASON_BYTES_MAX`] bytes. Empty: none was given.
@@ -41,12 +41,12 @@ pub struct Stop {
 
 impl Stop {
     /// One of which nothing more is known: nobody has signed it, given a reason, or said where it is.
-    pub fn new(stop_id: StopId, scope: Scope, level: StopLevel, engaged: Utc) -> Self {
+    pub fn new(stop_id: StopId, scope: Scope, level: StopLevel, engaged_unix_ms: Utc) -> Self {
         Self {
             stop_id,
             scope,
             level,
-            engaged,
+            engaged_unix_ms,
             actor: String::new(),
             reason: String::new(),
             region: None,
@@ -76,7 +76,7 @@ impl Stop {
             region,
             scope: self.scope.max(other.scope),
             level: self.level.max(other.level),
-            engaged: self.engaged.max(other.engaged),
+            engaged_unix_ms: self.engaged_unix_ms.max(other.engaged_unix_ms),
             actor: self.actor.max(other.actor),
             reason: self.reason.max(other.reason),
             proof: self.proof.max(other.proof),
@@ -92,7 +92,7 @@ pub struct Reset {
     /// Which stop.
     pub stop_id: StopId,
     /// When, UTC of the stop service's wall.
-    pub at: Utc,
+    pub reset_unix_ms: Utc,
     /// The actor that reset it, by name.
     pub actor: String,
     /// Why, in a person's words.
@@ -107,8 +107,8 @@ pub struct Reset {
 
 impl Reset {
     /// One of which nothing more is known: nobody has signed it or given a reason.
-    pub fn new(stop_id: StopId, at: Utc) -> Self {
-        Self { stop_id, at, actor: String::new(), reason: String::new(), proof: Vec::new(), token_id: None }
+    pub fn new(stop_id: StopId, reset_unix_ms: Utc) -> Self {
+        Self { stop_id, reset_unix_ms, actor: String::new(), reason: String::new(), proof: Vec::new(), token_id: None }
     }
 }
 
@@ -209,17 +209,18 @@ impl Latch {
     /// Forgets resets that are older than [`limits::RESETS_KEPT`], with their stops; and of the rest as many of the oldest as there are more than
     /// `resets_max`. Never a stop that is not reset. [`Latch::forgotten`] says up to where. Whether anything was forgotten.
     pub fn forget(&mut self, now: Utc, resets_max: usize) -> bool {
-        let old = self.resets.values().filter(|reset| is_past(reset.at, now)).count();
+        let old = self.resets.values().filter(|reset| is_past(reset.reset_unix_ms, now)).count();
         let surplus = self.resets.len().saturating_sub(resets_max).max(old);
         if surplus == 0 {
             return false;
         }
-        let mut by_age: Vec<_> = self.resets.values().map(|reset| (reset.at, reset.stop_id.clone())).collect();
+        let mut by_age: Vec<_> =
+            self.resets.values().map(|reset| (reset.reset_unix_ms, reset.stop_id.clone())).collect();
         by_age.sort_unstable();
         for (reset, stop_id) in by_age.into_iter().take(surplus) {
             self.resets.remove(&stop_id);
             // Of a stop that was never known all that is sure is that it came before its reset.
-            let engaged = self.stops.remove(&stop_id).map_or(reset, |stop| stop.engaged);
+            let engaged = self.stops.remove(&stop_id).map_or(reset, |stop| stop.engaged_unix_ms);
             self.forgotten = self.forgotten.max(engaged);
         }
         true
@@ -273,12 +274,13 @@ mod tests {
         let regions = proptest::option::of((0..3_i32).prop_map(|x| Region::of_box(x, 0, x + 1, 1)));
         // Few names, so that tellings of one stop differ.
         (0..4_u8, scopes, levels, regions, 0..3_i64, "[ab]").prop_map(|(n, scope, level, region, engaged, actor)| {
-            Stop { scope, level, region, engaged: Utc(engaged), actor, ..stop(n) }
+            Stop { scope, level, region, engaged_unix_ms: Utc(engaged), actor, ..stop(n) }
         })
     }
 
     fn any_fact() -> impl Strategy<Value = Fact> {
-        let resets = (0..4_u8, 0..3_i64, "[ab]").prop_map(|(n, at, actor)| Reset { at: Utc(at), actor, ..reset(n) });
+        let resets =
+            (0..4_u8, 0..3_i64, "[ab]").prop_map(|(n, at, actor)| Reset { reset_unix_ms: Utc(at), actor, ..reset(n) });
         prop_oneof![any_stop().prop_map(Fact::Engaged), resets.prop_map(Fact::Reset)]
     }
 

@@ -42,7 +42,11 @@ impl Record for StopRecord {
         self.stop.stop_id.to_string()
     }
     fn index(&self) -> Index {
-        Index { state: Some(i64::from(self.is_effective())), order: Some(self.stop.engaged.0), ..Index::default() }
+        Index {
+            state: Some(i64::from(self.is_effective())),
+            order: Some(self.stop.engaged_unix_ms.0),
+            ..Index::default()
+        }
     }
 }
 
@@ -88,13 +92,17 @@ fn write(record: &StopRecord, expect: Expect) -> Item {
     let (actor, fact, note) = match &record.reset {
         Some(reset) => {
             let actor = Actor::new(&reset.actor, reset.token_id.clone());
-            (actor, "stop.reset", Note::new("stop.reset").because(&reset.reason).with("at_unix_ms", reset.at.0))
+            (
+                actor,
+                "stop.reset",
+                Note::new("stop.reset").because(&reset.reason).with("at_unix_ms", reset.reset_unix_ms.0),
+            )
         }
         None => {
             let level = format!("{:?}", stop.level);
             let note = Note::new("stop.engage").because(&stop.reason).with("level", level).with("scope", &stop.scope);
             let actor = Actor::new(&stop.actor, stop.token_id.clone());
-            (actor, "stop.engaged", note.with("at_unix_ms", stop.engaged.0))
+            (actor, "stop.engaged", note.with("at_unix_ms", stop.engaged_unix_ms.0))
         }
     };
     let note = note.about("stop", &stop.stop_id);

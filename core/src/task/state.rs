@@ -63,7 +63,7 @@ pub struct TaskState {
     /// Robot of the live or last attempt.
     pub robot_id: Option<RobotId>,
     /// Set once the first irreversible step is done or unknown: bound to that robot.
-    pub opened: Option<RobotId>,
+    pub opened_robot_id: Option<RobotId>,
     /// Steps done: where the next attempt begins.
     pub next_step: u32,
     /// Attempts that were accepted and ended without success.
@@ -109,7 +109,7 @@ impl TaskState {
             holds: BTreeSet::new(),
             epoch: 0,
             robot_id: None,
-            opened: None,
+            opened_robot_id: None,
             next_step: 0,
             failures: 0,
             refusals_in_row: 0,
@@ -291,7 +291,7 @@ pub struct Attempt {
     #[serde(default)]
     pub reported: Option<u32>,
     /// Its first irreversible step is done or unknown.
-    pub opened: bool,
+    pub is_opened: bool,
     /// When it was offered, UTC.
     pub offered: Utc,
     /// When the robot took it, UTC; none: it has not.

@@ -73,7 +73,7 @@ impl From<&Stop> for v1::Stop {
             stop_id: stop.stop_id.to_string(),
             scope: Some((&stop.scope).into()),
             level: stop.level.to_wire(),
-            engaged_unix_ms: stop.engaged.0,
+            engaged_unix_ms: stop.engaged_unix_ms.0,
             actor: stop.actor.clone(),
             reason: stop.reason.clone(),
             boxes: stop.region.iter().flat_map(|region| region.boxes().iter().map(Into::into)).collect(),
@@ -110,7 +110,7 @@ impl Parse<Stop> for v1::Stop {
             stop_id: stop_id?,
             scope: scope?,
             level: level?,
-            engaged: Utc(self.engaged_unix_ms),
+            engaged_unix_ms: Utc(self.engaged_unix_ms),
             actor: self.actor,
             reason: self.reason,
             region,
@@ -125,7 +125,7 @@ impl From<&Reset> for v1::Reset {
     fn from(reset: &Reset) -> Self {
         Self {
             stop_id: reset.stop_id.to_string(),
-            at_unix_ms: reset.at.0,
+            at_unix_ms: reset.reset_unix_ms.0,
             actor: reset.actor.clone(),
             reason: reset.reason.clone(),
             proof: reset.proof.clone(),
@@ -153,7 +153,7 @@ impl Parse<Reset> for v1::Reset {
         let proof = is_mark.then_some(self.proof);
         Some(Reset {
             stop_id: stop_id?,
-            at: Utc(self.at_unix_ms),
+            reset_unix_ms: Utc(self.at_unix_ms),
             actor: actor?,
             reason: reason?,
             proof: proof?,

@@ -77,7 +77,7 @@ fn a_reset_on_the_link_counts_by_the_mark_of_the_stop_service_alone() {
     let mut rig = halted();
     let forged = marked(reset(1), &SecretKey::of_seed([4; 32]));
     let of_another = Reset { stop_id: stop_id(1), ..marked(reset(2), &service()) };
-    let older = marked(Reset { at: Utc(1_699_999_999_999), ..reset(1) }, &service());
+    let older = marked(Reset { reset_unix_ms: Utc(1_699_999_999_999), ..reset(1) }, &service());
     for refused in [reset(1), forged, of_another, older, marked(reset(2), &service())] {
         says(&mut rig, vec![], vec![refused.clone()]);
         assert!(is_stopped(&rig), "freed by {refused:?}");

@@ -92,7 +92,7 @@ pub fn incident(row: &Incident, revision: Revision) -> v1::Incident {
         robot_id: text(row.robot_id.as_ref().map(ToString::to_string)),
         task_id: text(row.task_id.as_ref().map(ToString::to_string)),
         area_id: text(row.area_id.as_ref().map(ToString::to_string)),
-        open_time: Some(timestamp(row.opened)),
+        open_time: Some(timestamp(row.opened_unix_ms)),
         closed: row.closed.as_ref().map(|closed| v1::IncidentClosed {
             actor: closed.actor.clone(),
             reason: closed.reason.clone(),

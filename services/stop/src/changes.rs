@@ -125,7 +125,7 @@ pub fn adopt(inner: &Inner, robot_id: &RobotId, stops: Vec<Stop>, more: Vec<Stop
     };
     // Outside of the lock: a signature takes its time.
     // What is not newer than what was forgotten may have been reset: it stops the robot that brings it, and nobody else.
-    let is_young = |stop: &Stop| stop.engaged > forgotten && !is_past(stop.engaged, now.wall);
+    let is_young = |stop: &Stop| stop.engaged_unix_ms > forgotten && !is_past(stop.engaged_unix_ms, now.wall);
     let (own, others): (Vec<Stop>, Vec<Stop>) =
         is_lost.into_iter().partition(|stop| is_young(stop) && inner.key.knows(stop));
     foreign.extend(others.into_iter().map(|stop| stop.stop_id));
@@ -268,7 +268,7 @@ mod tests {
         lock(&inner.engaged_stops).shorten(inner.clock.now().wall);
         assert!(lock(&inner.engaged_stops).latch().stop(&old.stop_id).is_none(), "it is forgotten with its reset");
         let lost_id = StopId::parse("STOP-LATER").unwrap();
-        let mut lost = Stop::new(lost_id.clone(), Scope::Fleet, StopLevel::Halt, newer.engaged);
+        let mut lost = Stop::new(lost_id.clone(), Scope::Fleet, StopLevel::Halt, newer.engaged_unix_ms);
         inner.key.mark(&mut lost);
         let robot_id = RobotId::parse("r1").unwrap();
         let foreign = adopt(&inner, &robot_id, vec![old.clone(), lost], Vec::new());

@@ -136,7 +136,7 @@ mod tests {
         assert!(key.knows(&back));
         for changed in [
             Stop { level: StopLevel::Slow, ..back.clone() },
-            Stop { engaged: Utc(2), ..back.clone() },
+            Stop { engaged_unix_ms: Utc(2), ..back.clone() },
             Stop { region: None, ..back.clone() },
             Stop { proof: vec![0; 64], ..back.clone() },
             Stop { proof: Vec::new(), ..back.clone() },
@@ -161,7 +161,7 @@ mod tests {
             public.verify_strict(&signed_reset(reset), &mark).is_ok()
         };
         assert!(knows(&back));
-        assert!(!knows(&Reset { at: Utc(3), ..back }));
+        assert!(!knows(&Reset { reset_unix_ms: Utc(3), ..back }));
     }
 
     #[test]

@@ -103,7 +103,7 @@ pub fn status(inner: &Inner) -> v1::Status {
         let stops = engaged_stops.effective().map(|(stop, since)| (stop.clone(), since)).collect();
         (stops, engaged_stops.version(), engaged_stops.latch().resets().map(|reset| reset.stop_id.clone()).collect())
     };
-    stops.sort_by(|(a, _), (b, _)| (a.engaged, &a.stop_id).cmp(&(b.engaged, &b.stop_id)));
+    stops.sort_by(|(a, _), (b, _)| (a.engaged_unix_ms, &a.stop_id).cmp(&(b.engaged_unix_ms, &b.stop_id)));
     let mut tally = Tally::new(&stops);
     let mut robots = Vec::new();
     for robot in inner.robots.all() {

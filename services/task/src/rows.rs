@@ -145,7 +145,7 @@ async fn join(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows>, Error>
             .transpose()?
             .flatten();
         let kept = holder.is_some_and(|h| keeps(&h, &state));
-        let allowed = allowed_resolutions(state.phase, state.opened.is_some(), kept);
+        let allowed = allowed_resolutions(state.phase, state.opened_robot_id.is_some(), kept);
         tasks.push(TaskRows { intake, state, revision, attempt, allowed });
     }
     Ok(tasks)

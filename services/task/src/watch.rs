@@ -211,9 +211,9 @@ impl Watcher {
         }
         self.teller.asked().await?;
         // What may be answered is about now: the robot's row as it is.
-        let asks = state.phase == Phase::NeedsOperator && state.opened.is_some();
+        let asks = state.phase == Phase::NeedsOperator && state.opened_robot_id.is_some();
         let kept = asks && robot_kept(self.service.store(), &state).await.map_err(unavailable)?;
-        let allowed = allowed_resolutions(state.phase, state.opened.is_some(), kept);
+        let allowed = allowed_resolutions(state.phase, state.opened_robot_id.is_some(), kept);
         let task =
             encode_task(TaskView { intake, state: &state, revision: entry.revision, attempt, allowed: &allowed });
         self.keep_near(&state, admitted);

@@ -55,7 +55,7 @@ fn compose(robot_id: &RobotId, said: &SiteStops, now: &SiteStops) -> VecDeque<St
     let mut stops: Vec<&Stop> = fresh().filter(|record| record.is_effective()).map(|record| &record.stop).collect();
     stops.sort_by_key(|stop| Reverse((stop.level, &stop.scope)));
     let mut resets: Vec<&Reset> = fresh().filter_map(|record| record.reset.as_ref()).collect();
-    resets.sort_by_key(|reset| Reverse(reset.at));
+    resets.sort_by_key(|reset| Reverse(reset.reset_unix_ms));
     resets.truncate(limits::LINK_RESETS_MAX);
     StopFacts::parts(stops, resets)
 }

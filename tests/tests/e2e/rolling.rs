@@ -197,7 +197,7 @@ pub async fn ran_in_their_drains(
             let permitted = moments
                 .granted_link
                 .with_context(|| format!("{robot} ran {version} and was never permitted: {moments:?}"))?;
-            let after_ms = entry.utc_ms - permitted.wall.0;
+            let after_ms = entry.utc_ms - permitted.wall_unix_ms.0;
             ensure!(
                 (0..=(limits::ACTIVATION_VALID.as_ms() + BEGIN_MS).cast_signed()).contains(&after_ms),
                 "{robot} ran {version} {after_ms} ms after its permission: {moments:?}"

@@ -203,7 +203,7 @@ impl Game {
             let theirs = |robot: &Option<RobotId>| robot.as_ref().is_some_and(|r| self.names.contains(r));
             let mine = |t: &&midshift_core::task::TaskState| {
                 let stuck = t.phase == Phase::NeedsOperator;
-                !t.phase.is_terminal() && (stuck || theirs(&t.robot_id) || theirs(&t.opened))
+                !t.phase.is_terminal() && (stuck || theirs(&t.robot_id) || theirs(&t.opened_robot_id))
             };
             let tasks: Vec<TaskId> = seen.tasks().values().filter(mine).map(|t| t.task_id.clone()).collect();
             (seen.places_of(&self.names), tasks)

@@ -199,7 +199,7 @@ impl Shift {
             .tasks()
             .values()
             .filter(waits)
-            .filter_map(|t| t.opened.as_ref())
+            .filter_map(|t| t.opened_robot_id.as_ref())
             .map(|r| r.to_string())
             .collect();
         bound.into_iter().for_each(|robot_id| self.order(Order::Uncordon(robot_id)));

@@ -88,7 +88,7 @@ fn offer(tx: &mut Tx, task: &TaskState, intake: &TaskIntake, robot_id: &RobotId,
     if let Some(visited) = &mut record.visited {
         visited.resume_step = task.next_step;
     }
-    record.opened = task.opened.is_some();
+    record.is_opened = task.opened_robot_id.is_some();
     attempts::take_robot(tx, &record);
     tx.put_row(record.clone(), "attempt.offered");
     arm(tx, TimerKind::OfferAck, &record.attempt, limits::OFFER_VALID.as_ms());

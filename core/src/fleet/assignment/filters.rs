@@ -118,7 +118,7 @@ fn prefer_others(
 ) -> Result<(), Reason> {
     let waited_ms = now.ms_since(task.queued_since);
     let is_early = waited_ms < limits::OTHERS_FIRST.as_ms();
-    let has_failed = task.opened.is_none() && task.failed_robots.contains(robot_id);
+    let has_failed = task.opened_robot_id.is_none() && task.failed_robots.contains(robot_id);
     if has_failed && is_early && another_could(view, task, intake, robot_id) {
         let told = "The robot failed this task, and for a while it is kept for another that could do it.";
         let left_ms = limits::OTHERS_FIRST.as_ms() - waited_ms;

@@ -36,7 +36,7 @@ pub(in crate::fleet) fn open_as(
     task_id: Option<&TaskId>,
 ) {
     if tx.view.incidents.len() >= limits::INCIDENTS_MAX {
-        let age = |i: &Incident| (i.closed.is_none(), i.opened);
+        let age = |i: &Incident| (i.closed.is_none(), i.opened_unix_ms);
         let oldest = tx.view.incidents.values().map(|i| &i.row).min_by_key(|i| age(i)).map(|i| i.id.clone());
         oldest.iter().for_each(|id| tx.delete::<Incident>(id, "incident.forgotten"));
     }
@@ -46,7 +46,7 @@ pub(in crate::fleet) fn open_as(
         robot_id: robot_id.cloned(),
         task_id: task_id.cloned(),
         area_id: None,
-        opened: tx.now.utc,
+        opened_unix_ms: tx.now.utc,
         closed: None,
     };
     tx.put_row(incident, "incident.opened");

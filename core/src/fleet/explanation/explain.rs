@@ -211,7 +211,7 @@ fn carries(view: &FleetProjection, board: &Board, robot_id: &RobotId) -> Option<
     let task = load.task_id.as_ref().and_then(|id| view.task(id));
     let is_its_own = |task: &TaskState| {
         let is_item = view.intake(&task.task_id).is_some_and(|intake| load::is_item_of(load, task, intake));
-        is_item && task.opened.as_ref().is_none_or(|r| r == robot_id)
+        is_item && task.opened_robot_id.as_ref().is_none_or(|r| r == robot_id)
     };
     let asks = task.is_some_and(|task| match task.phase {
         Phase::RetryWait => is_its_own(task),

@@ -107,13 +107,13 @@ pub fn attempt(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, tally: &
 
 /// The robot says that it carries something: an item of the task it works on opens that task, whatever else it says.
 pub fn carries(tx: &mut Tx, robot_id: &RobotId, load: &Load) {
-    let task = load.task_id.as_ref().and_then(|id| tx.view.task(id)).filter(|t| t.opened.is_none());
+    let task = load.task_id.as_ref().and_then(|id| tx.view.task(id)).filter(|t| t.opened_robot_id.is_none());
     let attempt = task.and_then(|t| t.attempt_id()).filter(|id| tx.view.held_by(robot_id) == Some(id));
     let Some((mut task, id)) = task.cloned().zip(attempt) else { return };
-    task.opened = Some(robot_id.clone());
+    task.opened_robot_id = Some(robot_id.clone());
     tx.put_row(task, "task.opened");
     if let Some(mut a) = tx.view.attempt(&id).cloned() {
-        a.opened = true;
+        a.is_opened = true;
         tx.put_row(a, "attempt.changed");
     }
 }

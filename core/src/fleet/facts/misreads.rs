@@ -19,7 +19,7 @@ use crate::time::{Now, Utc};
 fn open(view: &FleetProjection) -> impl Iterator<Item = (&RobotId, Utc, &Reason)> {
     let incidents = view.incidents.values().map(|i| &i.row);
     let open = incidents.filter(|i| i.closed.is_none() && i.reason.code == Code::RobotNotUnderstood);
-    open.filter_map(|i| Some((i.robot_id.as_ref()?, i.opened, &i.reason)))
+    open.filter_map(|i| Some((i.robot_id.as_ref()?, i.opened_unix_ms, &i.reason)))
 }
 
 /// Why a robot that is not heard is not; none: nobody knows, or it is heard.

@@ -130,7 +130,7 @@ fn lease_over(tx: &mut Tx, robot_id: &RobotId, tally: &mut Tally) {
             attempt: id,
             state: WorkState::Aborted,
             step_index: a.step_index,
-            opened: a.opened,
+            opened: a.is_opened,
             refusal: None,
             fault: None,
             stats,
@@ -155,7 +155,7 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
         attempt: id.clone(),
         state,
         step_index: listed.map_or(a.step_index, |l| l.step_index),
-        opened: a.opened || listed.is_some_and(|l| l.opened),
+        opened: a.is_opened || listed.is_some_and(|l| l.opened),
         refusal: None,
         fault: a.fault.clone(),
         stats: a.stats,
@@ -189,7 +189,7 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
             apply_event(tx, task_id, News { event: Event::SeenRunning, why: None, report: Some(&report) });
         }
         // The event that told of it was lost for good: what a robot says only adds.
-        Some(l) if l.step_index > a.step_index || (l.opened && !a.opened) => {
+        Some(l) if l.step_index > a.step_index || (l.opened && !a.is_opened) => {
             let Some(task_id) = id.subject.task_id() else { return };
             tally.repaired += 1;
             let report = report(l.state);

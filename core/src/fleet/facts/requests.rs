@@ -81,13 +81,13 @@ fn resolve(tx: &mut Tx, task_id: &TaskId, resolution: Resolution, request: &Task
     let Some(mut task) = tx.view.task(task_id).cloned() else { return };
     let kept =
         task.robot_id.as_ref().is_some_and(|r| tx.view.held_by(r) == task.attempt_id().as_ref() && task.epoch > 0);
-    if !allowed_resolutions(task.phase, task.opened.is_some(), kept).contains(&resolution) {
+    if !allowed_resolutions(task.phase, task.opened_robot_id.is_some(), kept).contains(&resolution) {
         return;
     }
     match resolution {
-        Resolution::RequeueHandedOver => task.opened = None,
+        Resolution::RequeueHandedOver => task.opened_robot_id = None,
         Resolution::RequeuePutBack => {
-            task.opened = None;
+            task.opened_robot_id = None;
             task.next_step = 0;
         }
         _ => {}

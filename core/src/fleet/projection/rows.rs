@@ -429,7 +429,7 @@ pub struct Incident {
     /// About which area.
     pub area_id: Option<AreaId>,
     /// UTC, site clock.
-    pub opened: Utc,
+    pub opened_unix_ms: Utc,
     /// A person has looked into it.
     #[serde(default)]
     pub closed: Option<Closed>,
@@ -454,7 +454,7 @@ impl Record for Incident {
     }
     fn index(&self) -> Index {
         let parent = self.robot_id.as_ref().map(|r| r.as_str().into());
-        Index { state: Some(i64::from(self.closed.is_none())), parent, order: Some(self.opened.0) }
+        Index { state: Some(i64::from(self.closed.is_none())), parent, order: Some(self.opened_unix_ms.0) }
     }
 }
 

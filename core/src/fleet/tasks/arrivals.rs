@@ -167,7 +167,7 @@ fn is_elsewhere(view: &FleetProjection, robot_id: &RobotId, place_id: &PlaceId) 
 /// An event says that the work is over and its robot was not seen there: the next heartbeat tells. What the event adds is taken.
 pub fn wait(tx: &mut Tx, report: &AttemptReport) {
     let Some(mut a) = tx.view.attempt(&report.attempt).cloned() else { return };
-    a.opened |= report.opened;
+    a.is_opened |= report.opened;
     a.stats = report.stats;
     a.fault = report.fault.clone().or(a.fault);
     tx.put_row(a, "attempt.changed");

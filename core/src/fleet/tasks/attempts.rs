@@ -55,7 +55,7 @@ pub fn fresh_attempt(tx: &Tx, attempt: AttemptId, robot_id: &RobotId, offer: cra
         offer,
         step_index: 0,
         reported: None,
-        opened: false,
+        is_opened: false,
         offered: tx.now.utc,
         accepted: None,
         ended: None,

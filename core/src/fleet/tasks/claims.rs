@@ -158,7 +158,7 @@ pub fn is_ahead(view: &FleetProjection, robot_id: &RobotId, now: &Now) -> bool {
     let told = view.incidents.values().map(|i| &i.row).filter(|i| is_it(i));
     let given = view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation);
     view.sessions.get(robot_id.as_str()).is_some_and(|s| s.row.followed_work() > given)
-        || told.into_iter().any(|i| now.ms_since(i.opened) <= limits::RESTORED_LATELY.as_ms())
+        || told.into_iter().any(|i| now.ms_since(i.opened_unix_ms) <= limits::RESTORED_LATELY.as_ms())
 }
 
 /// A robot entered on a grant that nobody gave it, of a place that it holds or not: people are told.

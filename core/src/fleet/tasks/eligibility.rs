@@ -95,13 +95,13 @@ fn bound(robot_id: &RobotId, task: &TaskState, intake: &TaskIntake) -> Result<()
     if spec.robot_id.as_ref().is_some_and(|r| r != robot_id) {
         return Err(Code::RobotPinnedElsewhere.into());
     }
-    if task.opened.as_ref().is_some_and(|r| r != robot_id) {
+    if task.opened_robot_id.as_ref().is_some_and(|r| r != robot_id) {
         return Err(Code::BoundElsewhere.into());
     }
     if task.semantic_refusers.contains(robot_id) {
         return Err(Code::UnsupportedAction.into());
     }
-    if spec.retry.exclude_failed_robot && task.opened.is_none() && task.failed_robots.contains(robot_id) {
+    if spec.retry.exclude_failed_robot && task.opened_robot_id.is_none() && task.failed_robots.contains(robot_id) {
         return Err(Code::ExcludedAfterFailure.into());
     }
     Ok(())

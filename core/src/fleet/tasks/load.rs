@@ -71,7 +71,7 @@ pub(in crate::fleet) fn end_word(tx: &mut Tx, live: &Live) {
 /// took it counts as done, and who still carries it by its own word carries something else.
 pub(in crate::fleet) fn is_item_of(load: &Load, task: &TaskState, intake: &TaskIntake) -> bool {
     let mut done = intake.spec.steps.iter().take(task.next_step as usize);
-    let was_taken = task.opened.is_some() || done.any(|step| step.effect == Effect::AtMostOnce);
+    let was_taken = task.opened_robot_id.is_some() || done.any(|step| step.effect == Effect::AtMostOnce);
     load.task_id.as_ref() == Some(&task.task_id) && was_taken
 }
 
@@ -107,7 +107,7 @@ pub(in crate::fleet) fn may_settle(
         let reason = Reason::new(Code::RobotLoaded, told).with("item", item);
         return no(load.task_id.iter().fold(reason, |reason, task_id| reason.with("task_id", task_id)));
     }
-    let opened = view.tasks.values().map(|task| &task.row).find(|task| task.opened.as_ref() == Some(robot_id));
+    let opened = view.tasks.values().map(|task| &task.row).find(|task| task.opened_robot_id.as_ref() == Some(robot_id));
     let Some(task) = opened else { return Ok(()) };
     let told = format!(
         "Task {0} is {1} and its item lies on {robot_id} as far as anybody knows: say first what became of it, with \
@@ -148,7 +148,7 @@ pub fn goes_on(view: &FleetProjection, live: Option<&Live>) -> bool {
     let task_id = carried(view, live).and_then(|load| load.task_id.as_ref());
     task_id.and_then(|id| view.task(id)).is_some_and(|task| {
         let waits = matches!(task.phase, Phase::Queued | Phase::RetryWait);
-        waits && task.opened.as_ref() == Some(&live.robot_id)
+        waits && task.opened_robot_id.as_ref() == Some(&live.robot_id)
     })
 }
 

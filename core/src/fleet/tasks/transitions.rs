@@ -53,7 +53,8 @@ pub fn apply_event(tx: &mut Tx, task_id: &TaskId, news: News) -> bool {
 }
 
 fn facts(tx: &Tx, task: &TaskState, intake: &TaskIntake, attempt: Option<&Attempt>, news: &News) -> Facts {
-    let opened = task.opened.is_some() || attempt.is_some_and(|a| a.opened) || news.report.is_some_and(|r| r.opened);
+    let opened =
+        task.opened_robot_id.is_some() || attempt.is_some_and(|a| a.is_opened) || news.report.is_some_and(|r| r.opened);
     let step = news.report.map(|r| r.step_index).or(attempt.map(|a| a.step_index)).unwrap_or(0) as usize;
     let begun = intake.spec.steps.iter().take(step + 1).skip(task.next_step as usize);
     let refusal = news.report.and_then(|r| r.refusal.as_ref()).map(|r| r.code);
@@ -112,7 +113,7 @@ fn phase_of(event: Event, report: Option<&AttemptReport>) -> Option<AttemptPhase
 fn move_attempt(tx: &mut Tx, mut a: Attempt, step: Next, news: &News, intake: &TaskIntake) -> Attempt {
     if let Some(report) = news.report {
         attempts::note_step(&mut a, report.step_index);
-        a.opened |= report.opened;
+        a.is_opened |= report.opened;
         a.stats = report.stats;
         a.fault = report.fault.clone().or(a.fault);
         a.refusal = report.refusal.clone().or(a.refusal);
@@ -301,7 +302,7 @@ fn move_task(tx: &mut Tx, mut t: TaskState, a: Option<&Attempt>, step: Next, new
         let proven = a.map(|a| arrivals::proven(tx.view, &tx.now, a, &intake.spec.steps, report.step_index));
         t.next_step = t.next_step.max(proven.unwrap_or(report.step_index));
         if report.opened {
-            t.opened = t.robot_id.clone();
+            t.opened_robot_id = t.robot_id.clone();
         }
     }
     if a.is_some_and(|a| a.accepted.is_some()) && t.started.is_none() {
@@ -509,10 +510,10 @@ pub fn wants_cancel(task: &TaskState) -> bool {
 
 /// Whether the task may wait for another robot from its next step boundary on: it runs, lets others go first, and is not opened.
 pub fn may_suspend(view: &FleetProjection, task_id: &TaskId, live: &Live) -> bool {
-    let Some(task) = view.task(task_id).filter(|t| t.phase == Phase::Running && t.opened.is_none()) else {
+    let Some(task) = view.task(task_id).filter(|t| t.phase == Phase::Running && t.opened_robot_id.is_none()) else {
         return false;
     };
-    let opened = task.attempt_id().and_then(|id| view.attempt(&id)).is_none_or(|a| a.opened);
+    let opened = task.attempt_id().and_then(|id| view.attempt(&id)).is_none_or(|a| a.is_opened);
     let preemptible = view.intake(task_id).is_some_and(|i| i.spec.preemptible);
     !opened && preemptible && load::carried(view, live).is_none()
 }

@@ -117,7 +117,7 @@ fn a_robot_that_never_left_its_place_is_not_believed_and_gets_no_work() {
     assert_eq!(told(&rig), []);
     assert!(lists(&mut rig, "park-a", WorkState::Succeeded, STEPS).contains(&"task.needs_operator"));
     let task = rig.task("T1");
-    assert_eq!((task.phase, task.next_step, &task.opened), (Phase::NeedsOperator, 0, &None));
+    assert_eq!((task.phase, task.next_step, &task.opened_robot_id), (Phase::NeedsOperator, 0, &None));
     let reason = task.reason.clone().expect("why");
     assert_eq!((reason.code, reason.metadata["place_id"].as_str()), (Code::GoalNotEntered, "A"));
     for words in ["never seen at A", "midshift task resolve T1", "midshift incident close GOAL_NOT_ENTERED:r1"] {
@@ -390,7 +390,7 @@ fn a_step_that_was_claimed_from_afar_is_not_done_unless_it_must_not_be_done_twic
         }
         reports(&mut rig, WorkState::Navigating, 2);
         let task = rig.task("T1");
-        assert_eq!((task.next_step, task.opened.is_some()), (done, !change), "{change} {is_in_a}");
+        assert_eq!((task.next_step, task.opened_robot_id.is_some()), (done, !change), "{change} {is_in_a}");
     }
 }
 

@@ -70,7 +70,7 @@ fn robots_that_crowd_one_place_are_one_incident_that_names_a_few_and_counts_all(
         assert_eq!(open(&rig).len(), usize::from(n > 1));
     }
     let incident = &rig.view.incidents.values().next().expect("an incident").row;
-    assert_eq!(incident.opened, second, "it is as old as the breach");
+    assert_eq!(incident.opened_unix_ms, second, "it is as old as the breach");
     let facts = &incident.reason.metadata;
     assert_eq!((facts["place_id"].as_str(), facts["inside"].as_str()), ("park-a", "31"));
     let first: Vec<String> = (1..=CROWD_NAMED_MAX).map(|n| format!("r{n}")).collect();

@@ -10,25 +10,25 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stamp {
     /// UTC of the wall.
-    pub wall: Utc,
+    pub wall_unix_ms: Utc,
     /// UTC of the wall when the run of the server began that saw it.
-    pub run: Utc,
+    pub run_started_unix_ms: Utc,
     /// The link clock of that run.
-    pub link: LinkTime,
+    pub link_ms: LinkTime,
 }
 
 impl Stamp {
     /// `now`, in the run that began at `started`.
     pub const fn new(now: &Now, started: &Now) -> Self {
-        Self { wall: now.wall, run: started.wall, link: now.link }
+        Self { wall_unix_ms: now.wall, run_started_unix_ms: started.wall, link_ms: now.link }
     }
 
     /// Milliseconds from `earlier` to `self`; zero if `earlier` is later.
     pub const fn ms_since(&self, earlier: &Self) -> u64 {
-        if self.run.0 == earlier.run.0 {
-            self.link.since(earlier.link).as_ms()
+        if self.run_started_unix_ms.0 == earlier.run_started_unix_ms.0 {
+            self.link_ms.since(earlier.link_ms).as_ms()
         } else {
-            self.wall.ms_since(earlier.wall)
+            self.wall_unix_ms.ms_since(earlier.wall_unix_ms)
         }
     }
 }

@@ -348,7 +348,7 @@ impl<'a> Situation<'a> {
         let Self { view, r, .. } = self;
         let life_ms = given.authority.life_ms();
         if view.bugs.time_releases_drain() {
-            let over = r.moments.granted_link.is_some_and(|at| self.now.wall.ms_since(at.wall) > life_ms);
+            let over = r.moments.granted_link.is_some_and(|at| self.now.wall.ms_since(at.wall_unix_ms) > life_ms);
             return over.then_some(Move::NotUsed);
         }
         let live = self.board.get(&r.robot_id).filter(|live| view.is_settled(live))?;

@@ -266,7 +266,7 @@ fn opened(rig: &mut Rig, n: usize, phase: crate::task::Phase) {
     };
     rig.put_row(TaskState {
         phase,
-        opened: Some(robot_id(n)),
+        opened_robot_id: Some(robot_id(n)),
         robot_id: Some(robot_id(n)),
         ..TaskState::born(&intake)
     });
@@ -352,7 +352,7 @@ fn charge(id: &crate::ids::AttemptId, errand: crate::task::state::Errand) -> cra
         offer: crate::authority::Authority { session_epoch: 2, hb: 1, valid_ms: 5_000 },
         step_index: 0,
         reported: None,
-        opened: false,
+        is_opened: false,
         offered: Utc(BEGIN),
         accepted: None,
         ended: None,

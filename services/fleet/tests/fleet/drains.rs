@@ -112,7 +112,7 @@ async fn a_robot_with_a_load_keeps_its_task_to_the_end() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
     w.submit_with("T1", "A", "B", |raw| raw.preemptible = true).await;
-    w.until("it has picked", |s| s.task("T1").opened.is_some()).await;
+    w.until("it has picked", |s| s.task("T1").opened_robot_id.is_some()).await;
     w.r("r1").load = Some(Load { task_id: None, item: "box".to_owned() });
     drain(&w, "r1", 20).await.expect("is asked");
     w.robot("r2", "park-b").await;

@@ -45,7 +45,8 @@ async fn a_person_settles_what_a_robot_carries_unless_the_robot_or_a_task_says_o
     assert_eq!(settle(&w).await, Err("NOT_ALLOWED_NOW".to_owned()), "its task asks a person first");
     let task_id = TaskId::parse("T1").expect("an id");
     w.ask(Ask::Resolve { task_id, resolution: Resolution::RequeuePutBack }).await;
-    w.until("it waits for another robot", |s| s.phase("T1") == Phase::Queued && s.task("T1").opened.is_none()).await;
+    w.until("it waits for another robot", |s| s.phase("T1") == Phase::Queued && s.task("T1").opened_robot_id.is_none())
+        .await;
     let control = settle(&w).await.expect("nobody says otherwise");
     assert_eq!(control.load_settled.expect("a word").reason, "I put it back on the shelf");
     let (waits_for, is_settled) = explained(&w).await;
@@ -71,7 +72,8 @@ async fn put_back(load_by_memory: bool) -> World {
     w.fleet.uncordon_robot(local(uncordon)).await.expect("uncordoned");
     let task_id = TaskId::parse("T1").expect("an id");
     w.ask(Ask::Resolve { task_id, resolution: Resolution::RequeuePutBack }).await;
-    w.until("the item is on the shelf", |s| s.phase("T1") == Phase::Queued && s.task("T1").opened.is_none()).await;
+    w.until("the item is on the shelf", |s| s.phase("T1") == Phase::Queued && s.task("T1").opened_robot_id.is_none())
+        .await;
     w
 }
 
@@ -86,7 +88,8 @@ async fn task_waits_for(w: &World) -> String {
 #[tokio::test(start_paused = true)]
 async fn a_robot_that_says_that_it_carries_an_item_that_was_put_back_is_not_given_its_task() {
     let mut w = put_back(false).await;
-    w.pass_while(60, "its hand is full", |s| s.phase("T1") == Phase::Queued && s.task("T1").opened.is_none()).await;
+    w.pass_while(60, "its hand is full", |s| s.phase("T1") == Phase::Queued && s.task("T1").opened_robot_id.is_none())
+        .await;
     assert_eq!(explained(&w).await, ("ROBOT_LOADED".to_owned(), false));
     assert_eq!(task_waits_for(&w).await, "robot r1: ROBOT_LOADED", "both say so");
     assert_eq!(settle(&w).await, Err("ROBOT_LOADED".to_owned()), "it feels it");
@@ -102,8 +105,10 @@ async fn a_load_that_a_robot_only_remembers_is_settled_by_a_persons_word_while_i
     w.r("r1").hears = false;
     let told = settle(&w).await.expect("it is told").load_settled.expect("a word");
     assert!(told.is_forget_pending);
-    w.pass_while(10, "it has not heard of it", |s| s.phase("T1") == Phase::Queued && s.task("T1").opened.is_none())
-        .await;
+    w.pass_while(10, "it has not heard of it", |s| {
+        s.phase("T1") == Phase::Queued && s.task("T1").opened_robot_id.is_none()
+    })
+    .await;
     let seen = w.seen().await;
     let word = seen.work("r1").load_word.expect("a word for the robot");
     assert_eq!(word.session_epoch, w.r("r1").session_epoch());
@@ -144,7 +149,7 @@ async fn a_word_about_a_load_holds_for_the_process_that_plans_next() {
     settle(&w).await.expect("nobody says otherwise");
     w.stop_fleet().await;
     w.start_fleet();
-    w.pass_while(40, "nobody thinks that r1 has begun it", |s| s.task("T1").opened.is_none()).await;
+    w.pass_while(40, "nobody thinks that r1 has begun it", |s| s.task("T1").opened_robot_id.is_none()).await;
     let (waits_for, is_settled) = explained(&w).await;
     assert!(is_settled && waits_for != "ROBOT_LOADED", "{waits_for}");
     w.lawful().await;

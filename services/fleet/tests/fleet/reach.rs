@@ -182,7 +182,7 @@ async fn an_incident_is_shown_and_closed_where_what_it_is_about_is() {
         robot_id,
         task_id: task_id.map(|id| TaskId::parse(id).expect("an id")),
         area_id: None,
-        opened: Utc(1),
+        opened_unix_ms: Utc(1),
         closed: None,
     };
     let rows = [

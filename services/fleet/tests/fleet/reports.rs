@@ -101,7 +101,7 @@ async fn a_load_binds_a_task_though_the_robot_never_says_that_it_opened_it() {
     w.until("it has failed with the item on it", |s| s.task("T1").failures == 1).await;
     assert!(w.r("r1").load.is_some());
     w.pass_while(60, "nobody else gets it", |s| s.robot_of("T1").as_deref() == Some("r1")).await;
-    assert_eq!(w.seen().await.task("T1").opened.map(|r| r.to_string()).as_deref(), Some("r1"));
+    assert_eq!(w.seen().await.task("T1").opened_robot_id.map(|r| r.to_string()).as_deref(), Some("r1"));
     w.lawful().await;
 }
 
@@ -114,7 +114,7 @@ async fn a_load_that_the_heartbeat_alone_tells_binds_its_task() {
     w.pass(3).await;
     w.r("r1").forgets_its_work();
     let seen = w.until_phase("T1", Phase::NeedsOperator).await;
-    assert_eq!(seen.task("T1").opened.map(|r| r.to_string()).as_deref(), Some("r1"));
+    assert_eq!(seen.task("T1").opened_robot_id.map(|r| r.to_string()).as_deref(), Some("r1"));
     w.lawful().await;
 }
 
@@ -123,9 +123,9 @@ async fn a_step_that_the_heartbeat_alone_tells_as_opened_keeps_the_task_from_a_s
     let (mut w, attempt) = at_the_pick().await;
     w.robot("r2", "park-b").await;
     w.r("r1").lists_alone(&attempt, 2, true);
-    w.until("it is kept", |s| s.attempt("T1").opened && s.attempt("T1").step_index == 2).await;
+    w.until("it is kept", |s| s.attempt("T1").is_opened && s.attempt("T1").step_index == 2).await;
     w.r("r1").forgets_its_work();
     let seen = w.until_phase("T1", Phase::NeedsOperator).await;
-    assert_eq!(seen.task("T1").opened.map(|r| r.to_string()).as_deref(), Some("r1"), "nobody else gets it");
+    assert_eq!(seen.task("T1").opened_robot_id.map(|r| r.to_string()).as_deref(), Some("r1"), "nobody else gets it");
     w.lawful().await;
 }

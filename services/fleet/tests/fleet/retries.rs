@@ -55,7 +55,7 @@ async fn an_opened_task_is_tried_again_only_by_the_robot_that_carries_it_and_wit
     w.r("r1").fails = Some((2, obstacle()));
     w.submit_with("T1", "A", "B", |raw| raw.retry = twice()).await;
     let seen = w.until_phase("T1", Phase::RetryWait).await;
-    assert_eq!(seen.task("T1").opened.as_ref().map(|r| r.as_str()), Some("r1"));
+    assert_eq!(seen.task("T1").opened_robot_id.as_ref().map(|r| r.as_str()), Some("r1"));
     assert_eq!(seen.task("T1").next_step, 2);
     let seen = w.until("it is offered again", |s| s.task("T1").epoch == 2).await;
     assert_eq!(seen.robot_of("T1").as_deref(), Some("r1"));

@@ -43,7 +43,7 @@ async fn a_robot_waits_for_a_place_that_is_kept_for_another_and_explain_says_for
         (raw.robot_id, raw.stall_ms) = ("r1".to_owned(), Some(3_600_000));
     })
     .await;
-    w.until("r1 has its item", |s| s.task("T1").opened.is_some()).await;
+    w.until("r1 has its item", |s| s.task("T1").opened_robot_id.is_some()).await;
     w.pass_while(100, "the charger is not given", |s| s.holders("charge").is_empty()).await;
     let told = w.fleet.explain_task(local(v1::ExplainTaskRequest { task_id: "T1".to_owned() })).await;
     let verdict = told.expect("an explanation").into_inner().explanation.and_then(|e| e.verdict).expect("a verdict");

@@ -75,7 +75,7 @@ async fn age(store: &dyn Store, frames: &dyn FrameLog, now: Now, kept: &Kept) ->
 async fn reset(store: &dyn Store) -> Result<Option<Utc>, Error> {
     let snapshot = store.snapshot(&[Table::StopRecord]).await?;
     let records = snapshot.rows.iter().filter_map(|row| row.decode::<StopRecord>().ok());
-    Ok(records.filter_map(|record| record.reset).map(|reset| reset.at).min())
+    Ok(records.filter_map(|record| record.reset).map(|reset| reset.reset_unix_ms).min())
 }
 
 async fn first(store: &dyn Store, table: Table) -> Result<Option<Row>, Error> {

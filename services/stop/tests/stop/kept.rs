@@ -298,8 +298,8 @@ async fn what_was_reset_a_quarter_ago_is_forgotten_without_anybody_doing_anythin
     {
         let none = serde_json::Value::Null;
         let (mut file, mut kept) = midshift_latch::LatchFile::open(&path, limits::STOP_LATCH_BYTES, none).unwrap();
-        assert!(kept["latch"]["resets"][&over]["at"].is_i64(), "{kept}");
-        kept["latch"]["resets"][&over]["at"] = 1.into();
+        assert!(kept["latch"]["resets"][&over]["reset_unix_ms"].is_i64(), "{kept}");
+        kept["latch"]["resets"][&over]["reset_unix_ms"] = 1.into();
         file.write(&kept).unwrap();
     }
     let (written, _) = read();

@@ -233,7 +233,7 @@ pub fn attempt(task_id: &TaskId, epoch: u64, phase: AttemptPhase) -> Attempt {
         offer: midshift_core::authority::Authority { session_epoch: 1, hb: 1, valid_ms: 5_000 },
         step_index: 0,
         reported: None,
-        opened: false,
+        is_opened: false,
         offered: NOON,
         accepted: Some(NOON),
         ended: None,
