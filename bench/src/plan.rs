@@ -193,7 +193,7 @@ fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (
             processed_site: now.site,
             received_unix_ms: now.wall.0,
             progress_at: now.site,
-            clock_offset_ms: None,
+            clock: None,
         };
         board.insert(robot_id, Arc::new(live));
     }

@@ -226,8 +226,17 @@ pub struct Live {
     pub received_unix_ms: i64,
     /// When its progress number last changed, site clock.
     pub progress_at: crate::time::SiteTime,
-    /// Robot clock minus server clock, milliseconds, and its error.
-    pub clock_offset_ms: Option<(i64, u64)>,
+    /// How far its clock is off. None: not measured yet.
+    pub clock: Option<ClockOffset>,
+}
+
+/// How far the clock of a robot is off, as its gateway measured it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ClockOffset {
+    /// Robot clock minus server clock, milliseconds.
+    pub clock_offset_ms: i64,
+    /// Largest error of that, milliseconds.
+    pub clock_error_ms: u64,
 }
 
 impl Live {
@@ -244,8 +253,8 @@ pub struct Told {
     pub report: crate::robot::ReportedState,
     /// UTC of the gateway's wall at receipt, milliseconds.
     pub received_unix_ms: i64,
-    /// As [`Live::clock_offset_ms`].
-    pub clock_offset_ms: Option<(i64, u64)>,
+    /// As [`Live::clock`].
+    pub clock: Option<ClockOffset>,
 }
 
 impl Told {
@@ -268,16 +277,15 @@ impl Told {
         }
         let progressed = before.is_none_or(|before| before.report.progress() != self.report.progress());
         let progress_at = before.filter(|_| !progressed).map_or(now.site, |before| before.progress_at);
-        let Self { report, received_unix_ms, clock_offset_ms } = self;
+        let Self { report, received_unix_ms, clock } = self;
         let (robot_id, processed_at, processed_site) = (robot_id.clone(), now.link, now.site);
-        Some(Live { robot_id, report, processed_at, processed_site, received_unix_ms, progress_at, clock_offset_ms })
+        Some(Live { robot_id, report, processed_at, processed_site, received_unix_ms, progress_at, clock })
     }
 }
 
 impl From<&Live> for Told {
     fn from(live: &Live) -> Self {
-        let (received_unix_ms, clock_offset_ms) = (live.received_unix_ms, live.clock_offset_ms);
-        Self { report: live.report.clone(), received_unix_ms, clock_offset_ms }
+        Self { report: live.report.clone(), received_unix_ms: live.received_unix_ms, clock: live.clock }
     }
 }
 

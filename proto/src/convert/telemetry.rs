@@ -46,8 +46,8 @@ pub fn encode_robot(view: RobotView<'_>, now: Now) -> v1::Robot {
     };
     let last_heard = presence.filter(|_| live.is_none()).and_then(|row| row.last_heard.as_ref());
     // The live board measures; the row keeps what was known at Hello.
-    let measured = live.and_then(|l| l.clock_offset_ms);
-    let offset = measured.map(|(offset, _)| offset).or_else(|| session.and_then(|s| s.clock_offset_ms));
+    let measured = live.and_then(|l| l.clock);
+    let offset = measured.map(|clock| clock.clock_offset_ms).or_else(|| session.and_then(|s| s.clock_offset_ms));
     v1::Robot {
         robot_id: robot_id.to_string(),
         presence: shown_presence(presence, live).to_wire(),
@@ -58,7 +58,7 @@ pub fn encode_robot(view: RobotView<'_>, now: Now) -> v1::Robot {
         age: live.map(|l| super::duration(now.link.since(l.processed_at).as_ms())),
         session_epoch: session.map(|s| s.session_epoch).unwrap_or_default(),
         clock_offset_ms: offset,
-        clock_error_ms: measured.map(|(_, error)| error),
+        clock_error_ms: measured.map(|clock| clock.clock_error_ms),
         observed: observed_since.is_some(),
         ring: session.map(|s| s.ring.clone()).unwrap_or_default(),
         durable: lane_marks(durable),

@@ -5,7 +5,7 @@ use midshift_core::reason::Code;
 use midshift_core::robot::{Inventory, Lane, Mode, Presence, ReportedState};
 use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
 use midshift_core::update::{Installed, InstalledSet};
-use midshift_core::work::{Gap, InboxEntry, InboxItem, Live, PresenceRow, Session};
+use midshift_core::work::{ClockOffset, Gap, InboxEntry, InboxItem, Live, PresenceRow, Session};
 use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot};
 use midshift_proto::convert::{ms_of, time_of};
 use midshift_proto::{link, telemetry::v1};
@@ -55,7 +55,7 @@ fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembe
         processed_site: SiteTime(1_000),
         received_unix_ms: 3_500,
         progress_at: SiteTime(0),
-        clock_offset_ms: Some((12, 2)),
+        clock: Some(ClockOffset { clock_offset_ms: 12, clock_error_ms: 2 }),
     };
     let durable = BTreeMap::from([(Lane::Event, 5)]);
     let id = robot();

@@ -2,6 +2,7 @@
 //!
 //! Only shown, and used to flag stamps from the future; nothing is ordered by it.
 
+use midshift_core::work::ClockOffset;
 use midshift_proto::session::ClockSample;
 use std::collections::VecDeque;
 
@@ -25,10 +26,13 @@ impl Offset {
         }
         self.samples.push_back(sample);
     }
-    /// Robot clock minus server clock, and the bound of its error; milliseconds.
-    pub fn estimate(&self) -> Option<(i64, u64)> {
+    /// Robot clock minus server clock, and the bound of its error. None: there is no sample.
+    pub fn estimate(&self) -> Option<ClockOffset> {
         let best = self.samples.iter().min_by_key(|s| s.delay_us())?;
-        Some((best.offset_us() / 1000, best.delay_us().unsigned_abs() / 2000 + 1))
+        Some(ClockOffset {
+            clock_offset_ms: best.offset_us() / 1000,
+            clock_error_ms: best.delay_us().unsigned_abs() / 2000 + 1,
+        })
     }
 }
 
@@ -41,11 +45,11 @@ mod tests {
         let mut offset = Offset::default();
         offset.add(ClockSample { t1_us: 0, t2_us: 900_000, t3_us: 900_000, t4_us: 1_000_000 });
         offset.add(ClockSample { t1_us: 5_000_000, t2_us: 4_801_000, t3_us: 4_801_000, t4_us: 5_002_000 });
-        assert_eq!(offset.estimate(), Some((200, 2)));
+        assert_eq!(offset.estimate(), Some(ClockOffset { clock_offset_ms: 200, clock_error_ms: 2 }));
         for _ in 0..SAMPLES {
             offset.add(ClockSample { t1_us: 0, t2_us: 10_000, t3_us: 10_000, t4_us: 20_000 });
         }
-        assert_eq!(offset.estimate(), Some((0, 11)));
+        assert_eq!(offset.estimate(), Some(ClockOffset { clock_offset_ms: 0, clock_error_ms: 11 }));
     }
 
     #[test]

@@ -363,7 +363,7 @@ impl Session {
             processed_site: now.site,
             received_unix_ms: now.wall.0,
             progress_at: self.progress.1,
-            clock_offset_ms: self.offset.estimate(),
+            clock: self.offset.estimate(),
         };
         let live = Arc::new(live);
         let clock = ClockSample { t1_us: heartbeat.sent_unix_us, t2_us, t3_us: t2_us, t4_us: 0 };
@@ -404,7 +404,8 @@ impl Session {
             return;
         }
         let (robot_id, ring, lane, epoch) = (&self.robot_id, &self.ring, batch.lane, self.epoch);
-        let ahead_ms = self.offset.estimate().map_or(limits::SKEW_ALERT_MS, |(offset, error)| offset + error as i64);
+        let clock = self.offset.estimate();
+        let ahead_ms = clock.map_or(limits::SKEW_ALERT_MS, |clock| clock.clock_offset_ms + clock.clock_error_ms as i64);
         let wall = self.inner.parts.clock.now().wall.0;
         let bugs = self.inner.parts.bugs;
         let arrived = self.events.arrive(batch, bugs, |what| InboxEntry {

@@ -96,7 +96,7 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
             return Ok(Begun { part: None, waits, welcome, mark, status });
         }
         let live = inner.parts.board.get(&hello.robot_id);
-        let measured = live.and_then(|live| live.clock_offset_ms).map(|(offset, _)| offset);
+        let measured = live.and_then(|live| live.clock).map(|clock| clock.clock_offset_ms);
         let clock_offset_ms = measured.or(row.as_ref().and_then(|(row, _)| row.clock_offset_ms));
         let known = row.as_ref().and_then(|(row, _)| known_device_key(row, robot.as_ref()));
         let mut said = judge(hello, known);

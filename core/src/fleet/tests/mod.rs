@@ -68,7 +68,7 @@ impl Rig {
             processed_site: self.now.site,
             received_unix_ms: self.now.wall.0,
             progress_at: self.now.site,
-            clock_offset_ms: None,
+            clock: None,
         };
         self.board.insert(robot_id, Arc::new(live));
     }

@@ -391,7 +391,7 @@ impl Rig {
             processed_site: self.now.site,
             received_unix_ms: self.now.wall.0,
             progress_at: self.now.site,
-            clock_offset_ms: None,
+            clock: None,
         };
         self.heard.insert(robot.id.clone());
         self.board.insert(robot.id.clone(), Arc::new(live));

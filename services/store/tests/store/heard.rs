@@ -6,12 +6,14 @@ use crate::support::{
 use midshift_core::ids::RobotId;
 use midshift_core::robot::ReportedState;
 use midshift_core::rows::{Expect, Item, Seq, Silent, Table, Writer};
-use midshift_core::work::Live;
+use midshift_core::work::{ClockOffset, Live};
 use midshift_store::{
     Applied, CommitError, Heard, HeardLog, LiveBoard, MemoryHeard, PostgresHeard, PostgresStore, Store, follow_heard,
 };
 use std::sync::Arc;
 use std::time::Duration;
+
+const OFFSET: ClockOffset = ClockOffset { clock_offset_ms: 3, clock_error_ms: 1 };
 
 fn robot(id: &str) -> RobotId {
     RobotId::parse(id).expect("a robot id")
@@ -145,7 +147,7 @@ fn live(id: &str, hb: u64) -> Live {
         processed_site: midshift_core::time::SiteTime(77),
         received_unix_ms: 5,
         progress_at: midshift_core::time::SiteTime(77),
-        clock_offset_ms: Some((3, 1)),
+        clock: Some(OFFSET),
     }
 }
 
@@ -163,7 +165,7 @@ async fn what_a_gateway_keeps_comes_onto_the_boards_of_others_by_their_own_clock
     log.keep_newest(vec![Heard::from(&live("a", 4))]).await.unwrap();
     changed.changed().await.unwrap();
     let seen = board.get(&robot("a")).expect("it is on the board");
-    assert_eq!((seen.report.hb, seen.received_unix_ms, seen.clock_offset_ms), (4, 5, Some((3, 1))));
+    assert_eq!((seen.report.hb, seen.received_unix_ms, seen.clock), (4, 5, Some(OFFSET)));
     assert_eq!(seen.processed_at, clock().now().link, "by the clock of whoever reads");
     assert!(board.get(&robot("old")).is_none(), "who was heard before is waited for");
     // What its own sessions put there is not replaced by what was read meanwhile.

@@ -328,7 +328,7 @@ impl Robot {
             processed_site: now.site,
             received_unix_ms: now.wall.0,
             progress_at: self.progress_at,
-            clock_offset_ms: None,
+            clock: None,
         }
     }
 
