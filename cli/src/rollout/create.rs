@@ -84,7 +84,7 @@ pub struct Create {
     /// Time after which a robot that is out of work for it and is not heard is lost, and somebody is told. Without it 15m.
     #[arg(long, value_parser = crate::duration)]
     lost_after: Option<Duration>,
-    /// Lost robots count in no budget until they are heard. Without it somebody has to say so: rollout lost.
+    /// Lost robots count in no budget until they are heard. Without it somebody has to say so: rollout write-off.
     #[arg(long)]
     write_off_lost: bool,
     /// No component may have a lower rollback index than this: robots refuse it. Without it 0; each robot holds its own floor beside it.

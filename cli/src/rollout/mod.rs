@@ -83,7 +83,7 @@ pub enum Verb {
         change: Change,
     },
     /// Say that a robot that is lost will not come back: it counts in no budget until it is heard, and keeps its drain.
-    Lost {
+    WriteOff {
         #[command(flatten)]
         one: One,
         /// The robot that will not come back.
@@ -139,7 +139,7 @@ impl Verb {
     /// The one roll-out that it is about, and the one robot in it.
     fn named(&mut self) -> (Option<&mut One>, Option<&mut String>) {
         match self {
-            Self::Exclude { one, robot_id, .. } | Self::Lost { one, robot_id, .. } => (Some(one), Some(robot_id)),
+            Self::Exclude { one, robot_id, .. } | Self::WriteOff { one, robot_id, .. } => (Some(one), Some(robot_id)),
             Self::Explain { one, robot_id } => (Some(one), robot_id.as_mut()),
             Self::Submit(said) | Self::Approve(said) | Self::Pause(said) => (Some(&mut said.one), None),
             Self::Start { said, .. } | Self::Retry { said, .. } => (Some(&mut said.one), None),
@@ -197,7 +197,9 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Exclude { one, robot_id, reason, change } => {
             exclude(&one.call, one.rollout_id, robot_id, reason, change, out).await
         }
-        Verb::Lost { one, robot_id, reason, change } => commands::write_off(one, robot_id, reason, change, out).await,
+        Verb::WriteOff { one, robot_id, reason, change } => {
+            commands::write_off(one, robot_id, reason, change, out).await
+        }
         Verb::Ls { call } => look::list(&call, out).await,
         Verb::Get { one, robots } => look::get(&one, robots, out).await,
         Verb::Robots(one) => look::robots(&one, out).await,

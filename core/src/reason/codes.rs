@@ -263,7 +263,7 @@ codes! {
     BlockedByWindow = "WINDOW_CLOSED", "The area's maintenance window is closed, or the area is frozen."
         => "It goes on when the window opens; the rules of the area may open it now.";
     BlockedBySilence = "ROBOT_SILENT", "The robot is out of work for a roll-out and is not heard."
-        => "Bring it back into reach. If it will not come, say so with `midshift rollout lost`: until it is heard it counts in no budget then, and keeps its drain.";
+        => "Bring it back into reach. If it will not come, say so with `midshift rollout write-off`: until it is heard it counts in no budget then, and keeps its drain.";
     BlockedByWave = "WAITING_FOR_WAVE", "Its wave has not begun."
         => "It begins once the wave before is kept; `midshift rollout get` shows what that one does.";
     BlockedByTurnInWave = "WAITING_FOR_TURN_IN_WAVE", "As many robots as the roll-out allows are out of work for it."

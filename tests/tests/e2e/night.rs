@@ -533,7 +533,7 @@ impl Night {
         let told = incidents(self.server.address)?;
         let is_told = told.iter().any(|i| i["robotId"] == robot.as_str() && i["reason"]["code"] == code);
         ensure!(is_told, "no incident of {robot}: {told:?}");
-        done(&["rollout", "lost", "--server", &self.address, id, &robot, "--reason", "nobody finds it"])?;
+        done(&["rollout", "write-off", "--server", &self.address, id, &robot, "--reason", "nobody finds it"])?;
         let rows = until("its robots", LIMIT, async || self.rows(id).await).await?;
         let is_given_up = |row: &RolloutRobot| row.robot_id == robot && row.written_off.is_some();
         ensure!(rows.iter().any(is_given_up), "{robot} holds others up: {rows:?}");

@@ -155,7 +155,7 @@ async fn on_a_split_site_each_hold_of_a_roll_out_is_told_with_its_reason_and_nob
     begin(&public, RELEASE)?;
     until_told(&public, RELEASE, ROBOT, Code::BlockedByWindow).await?;
     until_told(&public, RELEASE, PINNED, Code::SkippedPinned).await?;
-    let said = refused(&["rollout", "lost", "--server", &public, RELEASE, ROBOT, "--reason", "nobody finds it"])?;
+    let said = refused(&["rollout", "write-off", "--server", &public, RELEASE, ROBOT, "--reason", "nobody finds it"])?;
     ensure!(said.contains("is not out of work for this roll-out"), "{said}");
     let said = refused(&["robot", "unstick", "--server", &public, ROBOT, "--reason", "its disk has room"])?;
     ensure!(said.contains("is not stuck on its way back"), "{said}");

@@ -40,6 +40,6 @@ pub(super) fn note_of_verb(rollout_id: &RolloutId, verb: &Verb, reason: &str) ->
         Verb::Abort => of("rollout.abort"),
         Verb::RetryFailed => of("rollout.retry_failed"),
         Verb::Exclude(robot_id) => of("rollout.exclude").about("robot", robot_id),
-        Verb::Lost(robot_id) => of("rollout.lost").about("robot", robot_id),
+        Verb::WriteOff(robot_id) => of("rollout.write_off").about("robot", robot_id),
     }
 }

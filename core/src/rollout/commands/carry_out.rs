@@ -238,7 +238,7 @@ fn carry_out_verb(tx: &mut Tx, board: &Board, id: &RolloutId, verb: &Verb, actor
             let row = RolloutRobot::id_of(id, robot_id);
             moves::apply(tx, &NoSign, board, &row, Move::Skip(why(Code::SkippedExcluded)));
         }
-        Verb::Lost(robot_id) => {
+        Verb::WriteOff(robot_id) => {
             let Some(row) = tx.view.robot_of(id, robot_id).cloned() else { return };
             let act = compose_act(tx, actor, reason);
             moves::write_off(tx, row, act);

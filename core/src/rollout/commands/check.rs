@@ -170,7 +170,7 @@ fn verb_fits(view: &RolloutProjection, board: &Board, rollout: &Rollout, verb: &
             let known = known.ok_or_else(|| not_found(Code::RobotNotFound, "robot_id", robot_id))?;
             now_is(known.step < Step::Draining, known.step == Step::Skipped)
         }
-        Verb::Lost(robot_id) => {
+        Verb::WriteOff(robot_id) => {
             let known = view.robot_of(&rollout.rollout_id, robot_id);
             let known = known.ok_or_else(|| not_found(Code::RobotNotFound, "robot_id", robot_id))?;
             let after = rollout.spec.lost_after_ms;

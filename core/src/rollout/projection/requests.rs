@@ -37,8 +37,8 @@ pub enum Verb {
     RetryFailed,
     /// Leave a robot out.
     Exclude(RobotId),
-    /// A robot that is lost counts in no budget until it is heard.
-    Lost(RobotId),
+    /// Count a robot that is lost in no budget until it is heard.
+    WriteOff(RobotId),
 }
 
 /// One request.

@@ -36,7 +36,7 @@ fn told(rig: &Rig) -> usize {
 }
 
 fn write_off(first: usize) -> Verb {
-    Verb::Lost(robot_id(first))
+    Verb::WriteOff(robot_id(first))
 }
 
 #[test]

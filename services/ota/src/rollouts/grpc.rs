@@ -220,7 +220,7 @@ impl RolloutService {
         let request_id = request_id(&r.request_id, &mut bad);
         bad.finish()?;
         let about = About { by, rollout_id: &r.rollout_id, etag: &r.etag, reason: &r.reason };
-        let verb = Verb::Lost(robot_id.ok_or_else(internal)?);
+        let verb = Verb::WriteOff(robot_id.ok_or_else(internal)?);
         let (rollout, taken) = self.verb_once(about, verb, false, check_only(r.validate_only), request_id).await?;
         Ok(v1::WriteOffRobotResponse { rollout: Some(rollout), done_before: done_before(taken) })
     }
