@@ -104,7 +104,7 @@ fn manifest(draft: &Draft, content: impl Fn(usize) -> (Digest, u64)) -> Manifest
             capabilities: c.capabilities.iter().cloned().collect(),
             requires: c.requires.clone(),
             conflicts: c.conflicts.clone(),
-            task_schema: c.task_schema,
+            work_level: c.work_level,
             rollback_index: c.rollback_index,
             safety_class: c.safety_class,
             needs: c.needs,

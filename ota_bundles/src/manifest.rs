@@ -123,9 +123,9 @@ pub struct DraftComponent {
     /// Components that must not be there, up to this version.
     #[serde(default)]
     pub conflicts: BTreeMap<String, String>,
-    /// Lowest and highest schema of tasks it understands.
-    #[serde(default = "first_schema")]
-    pub task_schema: (u32, u32),
+    /// Levels of the work protocol that it understands. Absent: the first alone.
+    #[serde(default)]
+    pub work_level: WorkLevels,
     /// Rises when going back behind it would be dangerous. A robot with a higher floor refuses it.
     #[serde(default)]
     pub rollback_index: u64,
@@ -139,8 +139,20 @@ pub struct DraftComponent {
     pub data_migration: Migration,
 }
 
-const fn first_schema() -> (u32, u32) {
-    (1, 1)
+/// Levels of the work protocol, from 1 on: what assignments say, and what a robot answers to them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WorkLevels {
+    /// The lowest of them.
+    pub lowest: u32,
+    /// The highest of them.
+    pub highest: u32,
+}
+
+impl Default for WorkLevels {
+    /// The first alone.
+    fn default() -> Self {
+        Self { lowest: 1, highest: 1 }
+    }
 }
 
 /// A bundle as people write it, `bundle.toml`.
@@ -182,8 +194,8 @@ pub struct Component {
     pub requires: BTreeMap<String, String>,
     /// Components that must not be there, up to this version.
     pub conflicts: BTreeMap<String, String>,
-    /// Lowest and highest schema of tasks it understands.
-    pub task_schema: (u32, u32),
+    /// Levels of the work protocol that it understands.
+    pub work_level: WorkLevels,
     /// A robot with a higher floor refuses it.
     pub rollback_index: u64,
     /// Whether it bears on a safety function.
@@ -210,7 +222,7 @@ impl Component {
             capabilities: BTreeSet::new(),
             requires: BTreeMap::new(),
             conflicts: BTreeMap::new(),
-            task_schema: first_schema(),
+            work_level: WorkLevels::default(),
             rollback_index: 0,
             safety_class: SafetyClass::None,
             needs: Needs::Restart,
@@ -223,6 +235,15 @@ impl Component {
     pub fn target(&self) -> String {
         format!("{}-{}.component", self.name, self.version)
     }
+}
+
+/// A field of `given`, at any depth, that `read` does not have.
+fn unread_field(given: &serde_json::Value, read: &serde_json::Value) -> Option<String> {
+    let (given, read) = (given.as_object()?, read.as_object()?);
+    given.iter().find_map(|(name, value)| match read.get(name) {
+        Some(read) => unread_field(value, read),
+        None => Some(name.clone()),
+    })
 }
 
 /// A checked bundle.
@@ -275,11 +296,8 @@ impl Manifest {
     /// A field of a component in `bytes` that is not in what was read of them: it may ask for something that nobody here would see to.
     fn left_unread(&self, bytes: &[u8]) -> Option<String> {
         let given: serde_json::Value = serde_json::from_slice(bytes).ok()?;
-        let fields = |component: &serde_json::Value| component.as_object().cloned().unwrap_or_default();
-        given.get("components")?.as_array()?.iter().zip(&self.components).find_map(|(given, read)| {
-            let known = fields(&serde_json::to_value(read).ok()?);
-            fields(given).into_iter().map(|(name, _)| name).find(|name| !known.contains_key(name))
-        })
+        let mut components = given.get("components")?.as_array()?.iter().zip(&self.components);
+        components.find_map(|(given, read)| unread_field(given, &serde_json::to_value(read).ok()?))
     }
     /// Models that every component runs on.
     pub fn hardware(&self) -> BTreeSet<&str> {
@@ -355,8 +373,8 @@ impl Component {
         if self.conflicts.contains_key(&self.name) {
             bad.add(format!("{field}.conflicts"), "a component cannot be without itself");
         }
-        if self.task_schema.0 == 0 || self.task_schema.0 > self.task_schema.1 {
-            bad.add(format!("{field}.task_schema"), "must be lowest and highest, from 1 on");
+        if self.work_level.lowest == 0 || self.work_level.lowest > self.work_level.highest {
+            bad.add(format!("{field}.work_level"), "must have lowest from 1 on, and highest not below it");
         }
         if self.length == 0 || self.length > COMPONENT_BYTES_MAX {
             bad.add(format!("{field}.length"), format!("must be 1..{COMPONENT_BYTES_MAX} bytes"));

@@ -6,13 +6,13 @@
 
 use crate::bugs::Bugs;
 use crate::digest::Digest;
-use crate::manifest::{Component, ComponentKind, Manifest, SafetyClass};
+use crate::manifest::{Component, ComponentKind, Manifest, SafetyClass, WorkLevels};
 use midshift_core::task::raw::parse_version;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Schema of tasks that this build of midshift speaks.
-pub const TASK_SCHEMA: u32 = 1;
+/// Level of the work protocol that this build of midshift speaks.
+pub const WORK_LEVEL: u32 = 1;
 
 /// One whole set. A newer version's fields are not looked at where it stands on a ledger; on a disk its digest is its name.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -89,9 +89,9 @@ pub enum Unfit {
         /// Name of the component.
         component: String,
     },
-    /// It cannot read the tasks of this midshift.
-    #[error("{component} understands task schema {lowest} to {highest}, not {TASK_SCHEMA}")]
-    TaskSchema {
+    /// It cannot read the work of this midshift.
+    #[error("{component} understands levels {lowest} to {highest} of the work protocol, not {WORK_LEVEL}")]
+    WorkLevel {
         /// Name of the component.
         component: String,
         /// Its first.
@@ -120,7 +120,7 @@ impl Unfit {
             Self::Missing { .. } => "MISSING_COMPONENT",
             Self::Conflict { .. } => "CONFLICTING_COMPONENT",
             Self::SafetyRelated { .. } => "SAFETY_RELATED",
-            Self::TaskSchema { .. } => "TASK_SCHEMA",
+            Self::WorkLevel { .. } => "WORK_LEVEL",
             Self::Twice { .. } => "TWO_OF_A_KIND",
         }
     }
@@ -205,9 +205,9 @@ fn admissible(component: &Component, robot: &Fit) -> Vec<Unfit> {
     if component.safety_class != SafetyClass::None && !robot.allows_safety_related {
         unfit.push(Unfit::SafetyRelated { component: name() });
     }
-    let (lowest, highest) = component.task_schema;
-    if !(lowest..=highest).contains(&TASK_SCHEMA) {
-        unfit.push(Unfit::TaskSchema { component: name(), lowest, highest });
+    let WorkLevels { lowest, highest } = component.work_level;
+    if !(lowest..=highest).contains(&WORK_LEVEL) {
+        unfit.push(Unfit::WorkLevel { component: name(), lowest, highest });
     }
     unfit
 }

@@ -1,7 +1,7 @@
 //! What fits a robot, and every reason why something does not.
 
 use midshift_bundle::digest::Digest;
-use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest, SafetyClass};
+use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest, SafetyClass, WorkLevels};
 use midshift_bundle::set::{Fit, SetManifest, raised};
 use std::collections::BTreeMap;
 
@@ -55,15 +55,20 @@ fn a_bundle_replaces_what_it_names_and_leaves_the_rest() {
 }
 
 #[test]
-fn wrong_hardware_a_floor_a_safety_part_and_an_unknown_schema_are_all_told_at_once() {
+fn wrong_hardware_a_floor_a_safety_part_and_an_unknown_level_are_all_told_at_once() {
     let mut bad = gait("2.0.0");
     bad.hardware = ["h2".to_owned()].into();
     bad.safety_class = SafetyClass::Related;
-    bad.task_schema = (2, 3);
+    bad.work_level = WorkLevels { lowest: 2, highest: 3 };
     let robot = Fit { floors: BTreeMap::from([("gait".to_owned(), 4)]), ..robot() };
     let told = onto(&SetManifest::default(), vec![bad.clone()], &robot).expect_err("does not fit");
-    assert_eq!(told, ["WRONG_HARDWARE", "BELOW_FLOOR", "SAFETY_RELATED", "TASK_SCHEMA"]);
-    bad = Component { hardware: gait("2.0.0").hardware, task_schema: (1, 3), rollback_index: 4, ..bad };
+    assert_eq!(told, ["WRONG_HARDWARE", "BELOW_FLOOR", "SAFETY_RELATED", "WORK_LEVEL"]);
+    bad = Component {
+        hardware: gait("2.0.0").hardware,
+        work_level: WorkLevels { lowest: 1, highest: 3 },
+        rollback_index: 4,
+        ..bad
+    };
     let allowed = Fit { allows_safety_related: true, ..robot };
     assert!(onto(&SetManifest::default(), vec![bad], &allowed).is_ok());
 }
