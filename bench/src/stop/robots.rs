@@ -160,8 +160,9 @@ async fn attend(all: &All, proof: &Proof, at: usize, opening: &Semaphore) -> any
     loop {
         tokio::select! {
             message = down.message() => {
-                let message = message?.and_then(|m| m.message).context("the stop service ended the line")?;
-                robot.take_message(message).await?;
+                let said = message?.context("the stop service ended the line")?;
+                let message = said.message.context("the stop service says nothing")?;
+                robot.take_message(message, said.facts_generation).await?;
                 permit = permit.filter(|_| !lock(robot.seen).is_synced);
             }
             _ = beat.tick() => robot.check_in().await?,
@@ -181,22 +182,22 @@ struct Robot<'a> {
 }
 
 impl Robot<'_> {
-    async fn take_message(&mut self, message: Down) -> anyhow::Result<()> {
+    async fn take_message(&mut self, message: Down, facts_generation: u64) -> anyhow::Result<()> {
         let now_ns = fan::now_ns();
         match message {
-            Down::Told(told) => {
+            Down::Facts(facts) => {
                 let is_synced = {
                     let mut seen = lock(self.seen);
-                    if !told.stops.is_empty() {
+                    if !facts.stops.is_empty() {
                         seen.stop = Moments { told_ns: now_ns, acked_ns: 0 };
                     }
-                    seen.stops.extend(told.stops.into_iter().map(|stop| stop.stop_id));
-                    seen.stops.retain(|stop_id| !told.resets.iter().any(|reset| reset.stop_id == *stop_id));
+                    seen.stops.extend(facts.stops.into_iter().map(|stop| stop.stop_id));
+                    seen.stops.retain(|stop_id| !facts.resets.iter().any(|reset| reset.stop_id == *stop_id));
                     seen.is_answered = false;
                     seen.is_synced
                 };
                 if is_synced {
-                    self.generation = self.generation.max(told.generation);
+                    self.generation = self.generation.max(facts_generation);
                     self.say_news().await?;
                 }
             }
@@ -205,14 +206,14 @@ impl Robot<'_> {
                 lock(self.seen).is_synced = true;
                 self.say_news().await?;
             }
-            Down::CheckedIn(answer) if answer.nonce >= self.news => {
+            Down::CheckInAnswer(answer) if answer.nonce >= self.news => {
                 let mut seen = lock(self.seen);
                 if !seen.is_answered {
                     seen.is_answered = true;
                     seen.stop.acked_ns = now_ns;
                 }
             }
-            Down::CheckedIn(_) => {}
+            Down::CheckInAnswer(_) => {}
             Down::MoveOver(_) => bail!("the stop service asks for another line"),
         }
         Ok(())

@@ -92,7 +92,7 @@ class Stopped(unittest.TestCase):
 
     def test_a_stop_ends_by_its_reset_and_a_resume_in_either_order_and_outlives_a_restart(self):
         self.free()
-        self.line._hear(wire.AttendResponse(told=wire.Told(stops=[stop("STOP-1", stops.HALT)], generation=7)))
+        self.line._hear(wire.AttendResponse(facts=stop_pb2.StopFacts(stops=[stop("STOP-1", stops.HALT)]), facts_generation=7))
         self.line.obey((0, 0))
         self.assertEqual((self.line.level, self.line.inside, self.line.awaiting), (stops.HALT, ["STOP-1"], ["STOP-1"]))
         self.line.memory.save()
@@ -104,7 +104,7 @@ class Stopped(unittest.TestCase):
         self.line.obey((0, 0))
         self.assertEqual(self.line.level, stops.HALT, "a resume that overtakes the reset waits for it")
         reset = stop_pb2.Reset(stop_id="STOP-1", at_unix_ms=6)
-        self.line._hear(wire.AttendResponse(told=wire.Told(resets=[reset], generation=8)))
+        self.line._hear(wire.AttendResponse(facts=stop_pb2.StopFacts(resets=[reset]), facts_generation=8))
         self.line.obey((0, 0))
         self.assertEqual(self.line.level, stops.HALT, "a reset moves nobody")
         self.line.resumed(["STOP-1"])

@@ -162,7 +162,7 @@ impl Parse<Reset> for v1::Reset {
     }
 }
 
-impl From<&StopFacts> for link::StopFacts {
+impl From<&StopFacts> for v1::StopFacts {
     fn from(facts: &StopFacts) -> Self {
         Self {
             stops: facts.stops.iter().map(Into::into).collect(),
@@ -200,7 +200,7 @@ impl StopFacts {
     }
 }
 
-impl Parse<StopFacts> for link::StopFacts {
+impl Parse<StopFacts> for v1::StopFacts {
     fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<StopFacts> {
         let lengths = [("stops", self.stops.len()), ("resets", self.resets.len())];
         let mut is_short = true;
@@ -337,7 +337,7 @@ impl Parse<CheckIn> for v1::CheckIn {
 #[derive(Clone, Debug, PartialEq)]
 pub enum FromStop {
     /// Facts to add.
-    Told {
+    Facts {
         /// Stops that are engaged.
         stops: Vec<Stop>,
         /// Resets, each of one stop by its id.
@@ -353,7 +353,7 @@ pub enum FromStop {
         key: Vec<u8>,
     },
     /// The answer to a check-in.
-    CheckedIn {
+    CheckInAnswer {
         /// Its number.
         nonce: u64,
         /// State of the latch.
@@ -367,12 +367,12 @@ impl Parse<FromStop> for v1::AttendResponse {
     fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<FromStop> {
         use v1::attend_response::Message as W;
         match self.message {
-            Some(W::Told(told)) => {
-                let at = at.field("told");
-                let stops = list(told.stops, at.field("stops"), bad);
-                let resets = list(told.resets, at.field("resets"), bad);
-                let generation = counted(told.generation, at.field("generation"), bad);
-                Some(FromStop::Told { stops: stops?, resets: resets?, generation: generation? })
+            Some(W::Facts(facts)) => {
+                let generation = counted(self.facts_generation, at.field("facts_generation"), bad);
+                let at = at.field("facts");
+                let stops = list(facts.stops, at.field("stops"), bad);
+                let resets = list(facts.resets, at.field("resets"), bad);
+                Some(FromStop::Facts { stops: stops?, resets: resets?, generation: generation? })
             }
             Some(W::Synced(synced)) => {
                 let at = at.field("synced");
@@ -383,9 +383,9 @@ impl Parse<FromStop> for v1::AttendResponse {
                 }
                 Some(FromStop::Synced { generation: generation?, key: synced.key })
             }
-            Some(W::CheckedIn(answer)) => {
-                let generation = counted(answer.generation, at.field("checked_in").field("generation"), bad)?;
-                Some(FromStop::CheckedIn { nonce: answer.nonce, generation })
+            Some(W::CheckInAnswer(answer)) => {
+                let generation = counted(answer.generation, at.field("check_in_answer").field("generation"), bad)?;
+                Some(FromStop::CheckInAnswer { nonce: answer.nonce, generation })
             }
             Some(W::MoveOver(v1::MoveOver {})) => Some(FromStop::MoveOver),
             None => {

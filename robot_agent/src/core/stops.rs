@@ -52,7 +52,7 @@ impl AgentCore {
     }
 
     pub(crate) fn hear_stop(&mut self, now: &Now, mut news: StopNews) {
-        if let StopNews::Told { resets, .. } = &mut news
+        if let StopNews::Facts { resets, .. } = &mut news
             && self.config.bugs.reset_clears_all()
             && let Some(reset) = resets.first().cloned()
         {
@@ -72,7 +72,7 @@ impl AgentCore {
         let Some(facts) = down.stops.clone() else { return };
         if self.config.bugs.reset_clears_all() {
             let StopFacts { stops, resets } = facts;
-            self.hear_stop(now, StopNews::Told { stops, resets, generation: 0 });
+            self.hear_stop(now, StopNews::Facts { stops, resets, generation: 0 });
         } else if let Some(stop) = &mut self.stop {
             stop.take_link_facts(facts);
         }

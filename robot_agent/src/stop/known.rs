@@ -149,7 +149,7 @@ impl Stops {
                     said: None,
                 });
             }
-            StopNews::Told { stops, resets, generation } => {
+            StopNews::Facts { stops, resets, generation } => {
                 let is_changed = self.robot.told(stops, resets);
                 self.changed(is_changed);
                 // Before all was said, one part of it is no state of the latch.
@@ -167,7 +167,7 @@ impl Stops {
                     line.next = now;
                 }
             }
-            StopNews::CheckedIn { nonce, generation } => {
+            StopNews::CheckInAnswer { nonce, generation } => {
                 let fed = self.line.as_mut().and_then(|line| line.answered(now, nonce, generation));
                 fed.into_iter().for_each(|sent| self.robot.answered(sent));
             }

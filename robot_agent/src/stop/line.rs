@@ -182,13 +182,17 @@ impl Line {
             }
             Said::Heard(None) => self.lost("the line ended"),
             Said::Heard(Some(message)) => match parse(*message) {
-                Ok(FromStop::Told { stops, resets, generation }) => Some(StopNews::Told { stops, resets, generation }),
+                Ok(FromStop::Facts { stops, resets, generation }) => {
+                    Some(StopNews::Facts { stops, resets, generation })
+                }
                 Ok(FromStop::Synced { generation, key }) => {
                     self.failures = 0;
                     self.refused.forget();
                     Some(StopNews::Synced { generation, key })
                 }
-                Ok(FromStop::CheckedIn { nonce, generation }) => Some(StopNews::CheckedIn { nonce, generation }),
+                Ok(FromStop::CheckInAnswer { nonce, generation }) => {
+                    Some(StopNews::CheckInAnswer { nonce, generation })
+                }
                 Ok(FromStop::MoveOver) => {
                     if matches!(self.way, Way::Idle) {
                         let pause = self.rng.random_range(SOON_MS);

@@ -15,7 +15,7 @@ pub enum StopNews {
         nonce: u64,
     },
     /// Facts to add.
-    Told {
+    Facts {
         /// Stops that are engaged.
         stops: Vec<Stop>,
         /// Resets, each of one stop by its id.
@@ -31,7 +31,7 @@ pub enum StopNews {
         key: Vec<u8>,
     },
     /// The answer to one check-in.
-    CheckedIn {
+    CheckInAnswer {
         /// Its number.
         nonce: u64,
         /// State of the latch.

@@ -59,18 +59,23 @@ impl Seen {
         }
     }
     async fn send(&self, message: v1::attend_response::Message) {
-        self.down.send(Ok(v1::AttendResponse { message: Some(message) })).await.expect("the robot listens");
+        let said = v1::AttendResponse { message: Some(message), facts_generation: 0 };
+        self.down.send(Ok(said)).await.expect("the robot listens");
+    }
+    async fn send_facts(&self, facts: v1::StopFacts, facts_generation: u64) {
+        let message = Some(v1::attend_response::Message::Facts(facts));
+        self.down.send(Ok(v1::AttendResponse { message, facts_generation })).await.expect("the robot listens");
     }
     async fn tell_stops(&self, stops: &[Stop], generation: u64) {
         let stops = stops.iter().map(Into::into).collect();
-        self.send(v1::attend_response::Message::Told(v1::Told { stops, resets: vec![], generation })).await;
+        self.send_facts(v1::StopFacts { stops, resets: vec![] }, generation).await;
     }
     async fn synced(&self, generation: u64) {
         self.send(v1::attend_response::Message::Synced(v1::Synced { generation, ..Default::default() })).await;
     }
     async fn answer(&self, check_in: &v1::CheckIn, generation: u64) {
         let nonce = check_in.nonce;
-        self.send(v1::attend_response::Message::CheckedIn(v1::CheckedIn { nonce, generation })).await;
+        self.send(v1::attend_response::Message::CheckInAnswer(v1::CheckInAnswer { nonce, generation })).await;
     }
     /// Check-ins are answered until one is as it should be.
     async fn until(&mut self, generation: u64, is_it: impl Fn(&v1::CheckIn) -> bool) -> v1::CheckIn {
@@ -391,12 +396,7 @@ async fn a_message_that_cannot_be_read_ends_the_line_and_what_was_told_before_st
     let mut line = bench.free().await;
     line.tell_stops(&[stop(1, StopLevel::Halt)], 2).await;
     line.until(2, |c| c.obeys == HALT).await;
-    line.send(v1::attend_response::Message::Told(v1::Told {
-        stops: vec![v1::Stop::default()],
-        resets: vec![],
-        generation: 3,
-    }))
-    .await;
+    line.send_facts(v1::StopFacts { stops: vec![v1::Stop::default()], resets: vec![] }, 3).await;
     while line.next().await.is_some() {}
     let mut next = bench.line().await;
     let attend = next.attend().await;

@@ -40,13 +40,13 @@ fn answers_that_lay_in_a_buffer_feed_nothing() {
     assert!(late.len() >= 14 && !moves(&rig));
     let stood = level(&rig);
     for (nonce, _) in late {
-        hear_news(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED });
+        hear_news(&mut rig, StopNews::CheckInAnswer { nonce, generation: SYNCED });
     }
     rig.give(Input::Tick);
     assert_eq!((level(&rig), stood), (StopLevel::ControlledStopPosture, StopLevel::ControlledStopPosture));
     // Nor does the answer to a check-in of another.
     attend(&mut rig);
-    (0..9).for_each(|n| hear_news(&mut rig, StopNews::CheckedIn { nonce: n, generation: SYNCED }));
+    (0..9).for_each(|n| hear_news(&mut rig, StopNews::CheckInAnswer { nonce: n, generation: SYNCED }));
     assert_eq!(level(&rig), StopLevel::ControlledStopPosture);
     serve(&mut rig, 4_000);
     assert_eq!((level(&rig), awaiting(&rig).len()), (StopLevel::Halt, 1), "heard again, and a person resumes it");
@@ -58,7 +58,7 @@ fn an_answer_of_a_service_that_has_not_told_all_feeds_nothing_and_another_line_i
     for _ in 0..8 {
         rig.pass(500);
         for (nonce, _) in std::mem::take(&mut rig.stop.check_ins) {
-            hear_news(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED + 1 });
+            hear_news(&mut rig, StopNews::CheckInAnswer { nonce, generation: SYNCED + 1 });
         }
     }
     assert_eq!((rig.stop.redials.as_slice(), level(&rig)), (&["a stop was not told"][..], StopLevel::Slow));

@@ -38,7 +38,7 @@ pub fn hear_news(rig: &mut Rig, news: StopNews) {
 }
 
 pub fn told(rig: &mut Rig, stops: Vec<Stop>, resets: Vec<Reset>) {
-    hear_news(rig, StopNews::Told { stops, resets, generation: SYNCED });
+    hear_news(rig, StopNews::Facts { stops, resets, generation: SYNCED });
 }
 
 /// A line opens, and nothing is effective.
@@ -51,7 +51,7 @@ pub fn attend(rig: &mut Rig) {
 /// Every check-in that waits is answered.
 pub fn answer(rig: &mut Rig) {
     for (nonce, said) in std::mem::take(&mut rig.stop.check_ins) {
-        hear_news(rig, StopNews::CheckedIn { nonce, generation: said.generation });
+        hear_news(rig, StopNews::CheckInAnswer { nonce, generation: said.generation });
     }
 }
 
@@ -535,7 +535,7 @@ fn a_line_says_once_a_second_what_is_so_and_at_once_what_has_changed() {
         let waiting = rig.stop.check_ins.last().cloned();
         waiting
             .into_iter()
-            .for_each(|(nonce, _)| hear_news(&mut rig, StopNews::CheckedIn { nonce, generation: SYNCED }));
+            .for_each(|(nonce, _)| hear_news(&mut rig, StopNews::CheckInAnswer { nonce, generation: SYNCED }));
     }
     assert_eq!(rig.stop.check_ins.len(), 10);
     let nonces: BTreeSet<u64> = rig.stop.check_ins.iter().map(|(nonce, _)| *nonce).collect();

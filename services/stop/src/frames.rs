@@ -9,7 +9,11 @@ use midshift_proto::stop::v1::{self, attend_response::Message as W};
 use prost::Message;
 
 fn encoded(message: W) -> Bytes {
-    v1::AttendResponse { message: Some(message) }.encode_to_vec().into()
+    v1::AttendResponse { message: Some(message), facts_generation: 0 }.encode_to_vec().into()
+}
+
+fn encoded_facts(facts: v1::StopFacts, facts_generation: u64) -> Bytes {
+    v1::AttendResponse { message: Some(W::Facts(facts)), facts_generation }.encode_to_vec().into()
 }
 
 /// Stops and resets, in as many messages as they need. `generation` 0: they are a part of what `synced` ends.
@@ -18,11 +22,11 @@ pub fn told<'a>(
     resets: impl IntoIterator<Item = &'a Reset>,
     generation: u64,
 ) -> Vec<Bytes> {
-    let (mut all, mut next, mut bytes) = (Vec::new(), v1::Told { generation, ..v1::Told::default() }, 0);
-    let mut room_for = |more: usize, next: &mut v1::Told| {
+    let (mut all, mut next, mut bytes) = (Vec::new(), v1::StopFacts::default(), 0);
+    let mut room_for = |more: usize, next: &mut v1::StopFacts| {
         if bytes + more > limits::STOP_TOLD_BYTES && bytes > 0 {
-            let full = std::mem::replace(next, v1::Told { generation, ..v1::Told::default() });
-            all.push(encoded(W::Told(full)));
+            let full = std::mem::take(next);
+            all.push(encoded_facts(full, generation));
             bytes = 0;
         }
         bytes += more;
@@ -40,7 +44,7 @@ pub fn told<'a>(
         next.resets.push(reset);
     }
     if bytes > 0 {
-        all.push(encoded(W::Told(next)));
+        all.push(encoded_facts(next, generation));
     }
     all
 }
@@ -51,8 +55,8 @@ pub fn synced(generation: u64, key: &[u8]) -> Bytes {
 }
 
 /// The answer to a check-in.
-pub fn checked_in(nonce: u64, generation: u64) -> Bytes {
-    encoded(W::CheckedIn(v1::CheckedIn { nonce, generation }))
+pub fn check_in_answer(nonce: u64, generation: u64) -> Bytes {
+    encoded(W::CheckInAnswer(v1::CheckInAnswer { nonce, generation }))
 }
 
 /// Dial again.

@@ -204,7 +204,7 @@ impl Waiting {
             }
         }
         if let Some((nonce, _)) = self.answers.pop_front_if(|(_, generation)| *generation <= self.sent) {
-            return Some(frames::checked_in(nonce, self.sent));
+            return Some(frames::check_in_answer(nonce, self.sent));
         }
         std::mem::take(&mut self.moves_over).then(frames::move_over)
     }

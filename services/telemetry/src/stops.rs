@@ -136,7 +136,7 @@ mod tests {
         assert!(facts.len() > 1);
         for part in facts {
             assert!(part.stops.len() <= limits::STOPS_MAX && part.resets.len() <= limits::STOPS_MAX);
-            let wire = midshift_proto::link::v1::StopFacts::from(&part);
+            let wire = midshift_proto::stop::v1::StopFacts::from(&part);
             assert!(prost::Message::encoded_len(&wire) <= limits::STOP_TOLD_BYTES);
             assert_eq!(midshift_proto::parse::<StopFacts, _>(wire), Ok(part));
         }

@@ -77,9 +77,9 @@ async fn a_stop_service_whose_log_takes_nothing_engages_tells_and_resets() -> an
     let (mut is_engaged, mut is_reset) = (false, false);
     while !is_reset {
         let message = tokio::time::timeout(LIMIT, line.message()).await??.context("the line goes on")?;
-        if let Some(v1::attend_response::Message::Told(told)) = message.message {
-            is_engaged |= told.stops.iter().any(|stop| stop.stop_id == stop_id);
-            is_reset |= told.resets.iter().any(|reset| reset.stop_id == stop_id);
+        if let Some(v1::attend_response::Message::Facts(facts)) = message.message {
+            is_engaged |= facts.stops.iter().any(|stop| stop.stop_id == stop_id);
+            is_reset |= facts.resets.iter().any(|reset| reset.stop_id == stop_id);
         }
     }
     ensure!(is_engaged && !running.has_ended()?, "it was told of the reset alone, or the service is gone");

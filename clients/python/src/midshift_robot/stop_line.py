@@ -226,23 +226,23 @@ class StopLine:
             # The key of this machine lets nobody in any more, which only a person changes.
             is_revoked = any(b"KEY_DENIED" in value for key, value in self.line.call.trailing_metadata() or () if key.endswith("-bin"))
             self._lost(self.line.why, REVOKED_MS if is_revoked else None)
-        elif kind == "told":
-            self._add(message.told.stops, message.told.resets)
-            self._knows(message.told.generation)
+        elif kind == "facts":
+            self._add(message.facts.stops, message.facts.resets)
+            self._knows(message.facts_generation)
         elif kind == "synced":
             if message.synced.key and message.synced.key.hex() != self.memory["key"]:
                 self.memory["key"] = message.synced.key.hex()
             self.is_told, self.failures, self.told_why = True, 0, ""
             self._knows(message.synced.generation)
-        elif kind == "checked_in":
-            self._answered(message.checked_in)
+        elif kind == "check_in_answer":
+            self._answered(message.check_in_answer)
         elif kind == "move_over":
             self._lost("asked to move over", random.uniform(1, 500))
 
     def _knows(self, generation: int) -> None:
         self.generation, self.behind_ms = max(self.generation, generation), None
 
-    def _answered(self, answer: wire.CheckedIn) -> None:
+    def _answered(self, answer: wire.CheckInAnswer) -> None:
         if answer.nonce not in self.unanswered:
             return
         self.heard_ms = now_ms()

@@ -283,7 +283,7 @@ impl Robot {
     pub async fn read(&mut self) -> Result<bool, Status> {
         let Some(message) = within(self.down.message()).await? else { return Ok(false) };
         match midshift_proto::parse(message).unwrap() {
-            FromStop::Told { stops, resets, generation } => {
+            FromStop::Facts { stops, resets, generation } => {
                 for stop in stops {
                     self.latch.engage(stop);
                 }
@@ -296,7 +296,7 @@ impl Robot {
                 self.generation = self.generation.max(generation);
                 self.is_synced = true;
             }
-            FromStop::CheckedIn { nonce, generation } => {
+            FromStop::CheckInAnswer { nonce, generation } => {
                 assert_eq!(generation, self.generation, "an answer never overtakes what it speaks of");
                 self.answered = nonce;
             }
