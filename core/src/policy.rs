@@ -123,7 +123,7 @@ impl SoftwareRules {
     }
 }
 
-/// Rules of one area. A missing value means that this layer sets none, except for charging, which has defaults.
+/// Rules of one area, as an operator has them; robots get [`crate::work::AreaRules`] of them. A missing value means that this layer sets none, except for charging, which has defaults.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AreaPolicy {
     /// Which area.
@@ -140,9 +140,6 @@ pub struct AreaPolicy {
     pub charge_stop_permille: u16,
     /// Above this a charging robot may be called to work, permille.
     pub charge_preemptible_permille: u16,
-    /// No people walk here, as its site says: a robot bears the silence of the stop service longer. Set by fleet for robots; no person puts it.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub without_people: bool,
     /// Milliseconds of link time after which what a robot says of itself, and an open breaker, is an incident: see [`crate::fleet::explanation::lasting`].
     #[serde(default = "incident_after_ms")]
     pub incident_after_ms: u64,
@@ -166,7 +163,6 @@ impl AreaPolicy {
             charge_opportunistic_permille: 800,
             charge_stop_permille: 900,
             charge_preemptible_permille: 350,
-            without_people: false,
             incident_after_ms: incident_after_ms(),
             software: SoftwareRules::default(),
         }

@@ -9,6 +9,7 @@ pub use sessions::{ClockOffset, Condition, LaneMark, LastHeard, Live, PresenceRo
 
 use crate::authority::Authority;
 use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, StopId, WaypointId};
+use crate::policy::AreaPolicy;
 use crate::reason::Reason;
 pub use crate::robot::WorkState;
 use crate::robot::{Fault, HardwareStop, Lane, Load, Mode, StopLevel, Vitals};
@@ -202,7 +203,36 @@ pub struct DesiredPolicy {
     /// max(previous + 1, unix ms).
     pub generation: u64,
     /// One entry an area.
-    pub areas: Vec<crate::policy::AreaPolicy>,
+    pub areas: Vec<AreaRules>,
+}
+
+/// Rules of one area as a robot obeys them. What no robot obeys stays in [`AreaPolicy`].
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AreaRules {
+    /// Which area.
+    pub area_id: AreaId,
+    /// Millimetres per second; the lowest of all layers wins. None: this layer sets none.
+    pub speed_limit_mm_s: Option<u32>,
+    /// Millimetres kept to people and things; the largest of all layers wins. None: this layer sets none.
+    pub avoidance_distance_mm: Option<u32>,
+    /// Charging ends here, permille.
+    pub charge_stop_permille: u16,
+    /// No people walk here, as the site says: a robot bears the silence of the stop service longer.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub without_people: bool,
+}
+
+impl From<AreaPolicy> for AreaRules {
+    /// Where people may walk: a policy says nothing of that.
+    fn from(policy: AreaPolicy) -> Self {
+        Self {
+            area_id: policy.area_id,
+            speed_limit_mm_s: policy.speed_limit_mm_s,
+            avoidance_distance_mm: policy.avoidance_distance_mm,
+            charge_stop_permille: policy.charge_stop_permille,
+            without_people: false,
+        }
+    }
 }
 
 impl Record for DesiredPolicy {

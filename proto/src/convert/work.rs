@@ -6,10 +6,9 @@ use super::{
 };
 use crate::link::v1;
 use midshift_core::ids::{AreaId, DrainId, PlaceId, RobotId, WaypointId};
-use midshift_core::policy::AreaPolicy;
 use midshift_core::reason::Violations;
 use midshift_core::work::{
-    Assignment, DesiredPolicy, DesiredWork, GrantedPlace, LoadWord, RoutePoint, StepKind, WorkStep,
+    AreaRules, Assignment, DesiredPolicy, DesiredWork, GrantedPlace, LoadWord, RoutePoint, StepKind, WorkStep,
 };
 
 impl From<&WorkStep> for v1::WorkStep {
@@ -231,29 +230,28 @@ impl Parse<LoadWord> for v1::LoadWord {
     }
 }
 
-impl From<&AreaPolicy> for v1::AreaRules {
-    fn from(policy: &AreaPolicy) -> Self {
+impl From<&AreaRules> for v1::AreaRules {
+    fn from(rules: &AreaRules) -> Self {
         Self {
-            area_id: policy.area_id.to_string(),
-            speed_limit_mm_s: policy.speed_limit_mm_s,
-            avoidance_distance_mm: policy.avoidance_distance_mm,
-            charge_stop_permille: u32::from(policy.charge_stop_permille),
-            without_people: policy.without_people,
+            area_id: rules.area_id.to_string(),
+            speed_limit_mm_s: rules.speed_limit_mm_s,
+            avoidance_distance_mm: rules.avoidance_distance_mm,
+            charge_stop_permille: u32::from(rules.charge_stop_permille),
+            without_people: rules.without_people,
         }
     }
 }
 
-impl Parse<AreaPolicy> for v1::AreaRules {
-    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<AreaPolicy> {
+impl Parse<AreaRules> for v1::AreaRules {
+    fn parse_at(self, at: At<'_>, bad: &mut Violations) -> Option<AreaRules> {
         let area_id = id(&self.area_id, AreaId::parse, at.field("area_id"), bad);
         let stop = permille(self.charge_stop_permille, at.field("charge_stop_permille"), bad);
-        Some(AreaPolicy {
+        Some(AreaRules {
+            area_id: area_id?,
             speed_limit_mm_s: self.speed_limit_mm_s,
             avoidance_distance_mm: self.avoidance_distance_mm,
             charge_stop_permille: stop?,
             without_people: self.without_people,
-            // When it goes to charge, when people are told and what roll-outs keep to is no robot's matter.
-            ..AreaPolicy::default_of(area_id?)
         })
     }
 }

@@ -15,8 +15,8 @@ use midshift_core::stop::{Reset, Scope, Stop};
 use midshift_core::time::Utc;
 use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
 use midshift_core::work::{
-    Assignment, AttemptReport, DesiredPolicy, DesiredWork, Effect, Gap, GrantedPlace, InboxItem, LoadWord, PlaceNews,
-    RobotEvent, RoutePoint, Sample, SampleBody, StepKind, WorkState, WorkStats, WorkStep,
+    AreaRules, Assignment, AttemptReport, DesiredPolicy, DesiredWork, Effect, Gap, GrantedPlace, InboxItem, LoadWord,
+    PlaceNews, RobotEvent, RoutePoint, Sample, SampleBody, StepKind, WorkState, WorkStats, WorkStep,
 };
 use midshift_proto::link::v1;
 use midshift_proto::parse;
@@ -236,16 +236,16 @@ fn work() -> DesiredWork {
 }
 
 fn policy() -> DesiredPolicy {
-    let hall = AreaPolicy {
+    let hall = AreaRules {
         speed_limit_mm_s: Some(800),
         avoidance_distance_mm: Some(1_200),
         without_people: true,
-        ..AreaPolicy::default_of(AreaId::parse("hall").expect("id"))
+        ..AreaPolicy::default_of(AreaId::parse("hall").expect("id")).into()
     };
     DesiredPolicy {
         robot_id: robot(),
         generation: 12,
-        areas: vec![hall, AreaPolicy::default_of(AreaId::parse("yard").expect("id"))],
+        areas: vec![hall, AreaPolicy::default_of(AreaId::parse("yard").expect("id")).into()],
     }
 }
 

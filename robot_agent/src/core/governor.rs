@@ -7,15 +7,14 @@
 use crate::body::BodyLimits;
 use midshift_core::ids::AreaId;
 use midshift_core::limits;
-use midshift_core::policy::AreaPolicy;
 use midshift_core::robot::StopLevel;
-use midshift_core::work::RoutePoint;
+use midshift_core::work::{AreaRules, RoutePoint};
 
 /// Speed on the way to `point`, millimetres per second: the lowest of maker, area, lane, task and stop, but never below
 /// the floor of the body, which must be able to clear a lane.
 pub fn speed_mm_s(
     body: &BodyLimits,
-    areas: &[AreaPolicy],
+    areas: &[AreaRules],
     task_mm_s: Option<u32>,
     stop: StopLevel,
     point: &RoutePoint,
@@ -33,12 +32,12 @@ pub fn slowed_mm_s(body: &BodyLimits) -> u32 {
 }
 
 /// Distance to keep on the way to `point`, millimetres, as its area asks for; none: the body's own.
-pub fn keep_off_mm(areas: &[AreaPolicy], point: &RoutePoint) -> Option<u32> {
+pub fn keep_off_mm(areas: &[AreaRules], point: &RoutePoint) -> Option<u32> {
     policy_of(areas, &point.area_id).and_then(|p| p.avoidance_distance_mm)
 }
 
 /// The rules of one area, if any were pushed.
-pub fn policy_of<'a>(areas: &'a [AreaPolicy], area_id: &AreaId) -> Option<&'a AreaPolicy> {
+pub fn policy_of<'a>(areas: &'a [AreaRules], area_id: &AreaId) -> Option<&'a AreaRules> {
     areas.iter().find(|p| p.area_id == *area_id)
 }
 
@@ -46,6 +45,7 @@ pub fn policy_of<'a>(areas: &'a [AreaPolicy], area_id: &AreaId) -> Option<&'a Ar
 mod tests {
     use super::*;
     use midshift_core::ids::WaypointId;
+    use midshift_core::policy::AreaPolicy;
 
     #[test]
     fn the_lowest_layer_wins_and_the_floor_stands() {
@@ -69,7 +69,7 @@ mod tests {
             let strong = BodyLimits { floor_speed_mm_s: 400, ..body };
             assert_eq!((speed_mm_s(&strong, &[], None, stop, &point), slowed_mm_s(&strong)), (400, 400));
         }
-        let slow = |v| [AreaPolicy { speed_limit_mm_s: Some(v), ..AreaPolicy::default_of(area_id.clone()) }];
+        let slow = |v| [AreaRules { speed_limit_mm_s: Some(v), ..AreaPolicy::default_of(area_id.clone()).into() }];
         assert_eq!(speed_mm_s(&body, &slow(300), Some(700), StopLevel::None, &point), 300);
         assert_eq!(speed_mm_s(&body, &slow(200), None, StopLevel::Slow, &point), 200);
         assert_eq!(speed_mm_s(&body, &slow(60), None, StopLevel::None, &point), 100);

@@ -12,9 +12,8 @@ use super::software::SoftwareRow;
 use midshift_bundle::trust::Trusted;
 use midshift_core::ids::{AttemptId, DrainId, Subject};
 use midshift_core::limits;
-use midshift_core::policy::AreaPolicy;
 use midshift_core::robot::ReportedAttempt;
-use midshift_core::work::{AttemptReport, WorkState};
+use midshift_core::work::{AreaRules, AttemptReport, WorkState};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -26,7 +25,7 @@ pub struct Ledger {
     /// Generations of sections that were applied.
     pub applied: Applied,
     /// Rules of the areas, so that a restart never drives without them.
-    pub policy: Vec<AreaPolicy>,
+    pub policy: Vec<AreaRules>,
     /// The holder.
     pub holder: Option<Holder>,
     /// Places and grants.

@@ -6,9 +6,8 @@ use super::rows::{Applied, Holder, PlacesRow, SessionMemory};
 use super::software::SoftwareRow;
 use midshift_bundle::trust::Trusted;
 use midshift_core::ids::{AttemptId, DrainId, Subject};
-use midshift_core::policy::AreaPolicy;
 use midshift_core::robot::{Lane, ReportedAttempt};
-use midshift_core::work::{AttemptReport, Gap, Sample};
+use midshift_core::work::{AreaRules, AttemptReport, Gap, Sample};
 use std::sync::Arc;
 
 /// One change of what a robot remembers.
@@ -19,7 +18,7 @@ pub enum Op {
     /// Generations applied.
     Applied(Applied),
     /// Rules of the areas.
-    Policy(Vec<AreaPolicy>),
+    Policy(Vec<AreaRules>),
     /// Who holds the robot.
     Holder(Option<Box<Holder>>),
     /// Places and grants.

@@ -9,7 +9,7 @@ use midshift_core::ids::{AreaId, RobotId};
 use midshift_core::policy::AreaPolicy;
 use midshift_core::robot::{HardwareStop, Mode};
 use midshift_core::work::PlaceNews::{Entered, Left, NotEntered};
-use midshift_core::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, RoutePoint, WorkState};
+use midshift_core::work::{AreaRules, Assignment, DesiredPolicy, DesiredWork, GrantedPlace, RoutePoint, WorkState};
 use midshift_proto::session::Downlink;
 
 /// A, then B; a door on the way to C and on to D, where one stands; E is the goal.
@@ -284,7 +284,7 @@ fn the_distance_an_area_asks_for_reaches_the_body_under_way() {
     let asked = |rig: &Rig| rig.body.log().path.iter().map(|p| p.keep_off_mm).collect::<Vec<_>>();
     assert_eq!(asked(&rig), [None; 4]);
     let area_id = AreaId::parse("hall").expect("a name");
-    let area = AreaPolicy { avoidance_distance_mm: Some(800), ..AreaPolicy::default_of(area_id) };
+    let area = AreaRules { avoidance_distance_mm: Some(800), ..AreaPolicy::default_of(area_id).into() };
     let policy =
         DesiredPolicy { robot_id: RobotId::parse("rbt-01").expect("a name"), generation: 5, areas: vec![area] };
     rig.down(Downlink { policy: Some(policy), ..Downlink::default() });
@@ -297,9 +297,9 @@ fn a_policy_slows_a_drive_under_way_and_an_older_one_never_speeds_it_up() {
     let policy = |generation, limit| DesiredPolicy {
         robot_id: RobotId::parse("rbt-01").expect("a name"),
         generation,
-        areas: vec![AreaPolicy {
+        areas: vec![AreaRules {
             speed_limit_mm_s: Some(limit),
-            ..AreaPolicy::default_of(AreaId::parse("hall").expect("a name"))
+            ..AreaPolicy::default_of(AreaId::parse("hall").expect("a name")).into()
         }],
     };
     let speed = |rig: &Rig| rig.body.log().path[0].speed_mm_s;

@@ -9,7 +9,7 @@ use midshift_agent::stop::StopNews;
 use midshift_core::ids::{AreaId, RobotId, StopId};
 use midshift_core::policy::AreaPolicy;
 use midshift_core::robot::StopLevel;
-use midshift_core::work::DesiredPolicy;
+use midshift_core::work::{AreaRules, DesiredPolicy};
 use midshift_proto::session::Downlink;
 
 #[test]
@@ -66,7 +66,7 @@ fn an_answer_of_a_service_that_has_not_told_all_feeds_nothing_and_another_line_i
 
 /// The hall, without people if its rules say so.
 fn rules(rig: &mut Rig, without_people: bool) {
-    let area = AreaPolicy { without_people, ..AreaPolicy::default_of(AreaId::parse("hall").expect("a name")) };
+    let area = AreaRules { without_people, ..AreaPolicy::default_of(AreaId::parse("hall").expect("a name")).into() };
     let policy =
         DesiredPolicy { robot_id: RobotId::parse("rbt-01").expect("a name"), generation: 5, areas: vec![area] };
     rig.down(Downlink { policy: Some(policy), ..Downlink::default() });

@@ -167,7 +167,7 @@ fn rows(state: UpdateState) -> Vec<Op> {
     vec![
         Op::Session(SessionMemory { session_epoch: 3, secret: "s".into(), store_id: "store".into() }),
         Op::Applied(Applied { work: 4, policy: 5, update: 6 }),
-        Op::Policy(vec![AreaPolicy::default_of(AreaId::parse("hall").expect("a name"))]),
+        Op::Policy(vec![AreaPolicy::default_of(AreaId::parse("hall").expect("a name")).into()]),
         Op::Holder(Some(Box::new(holder))),
         Op::Places(places),
         Op::Maintenance(Some(DrainId::parse("drain-1").expect("a name"))),

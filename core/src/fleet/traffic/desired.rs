@@ -14,10 +14,9 @@ use crate::fleet::projection::state::{FleetProjection, held};
 use crate::fleet::tasks::{attempts, claims, load};
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
-use crate::policy::AreaPolicy;
 use crate::robot::ReportedAttempt;
 use crate::task::{Attempt, AttemptPhase, Then};
-use crate::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, Live, RoutePoint, WorkState};
+use crate::work::{AreaRules, Assignment, DesiredPolicy, DesiredWork, GrantedPlace, Live, RoutePoint, WorkState};
 use std::collections::BTreeMap;
 
 /// What a robot may do from this cycle on; `desired` writes it down.
@@ -238,7 +237,7 @@ pub fn compose_policy(tx: &mut Tx, robot_id: &RobotId) {
         .site
         .areas()
         .iter()
-        .map(|a| AreaPolicy { without_people: !a.people, ..tx.view.policy(&a.area_id) })
+        .map(|a| AreaRules { without_people: !a.people, ..tx.view.policy(&a.area_id).into() })
         .collect();
     let old = tx.view.desired_policy.get(robot_id.as_str()).map(|d| d.row.clone());
     if old.as_ref().is_some_and(|o| o.areas == areas) {
