@@ -26,8 +26,8 @@ pub enum Verb {
     /// Make the keys and the repository of a project. Secret keys are files that only you can read: keep copies of them elsewhere.
     Keygen {
         /// Who signs releases.
-        #[arg(long, value_enum, default_value_t = Who::Solo)]
-        profile: Who,
+        #[arg(long, value_enum, default_value_t = ProfileArg::Solo)]
+        profile: ProfileArg,
         /// A new folder for the secret keys.
         #[arg(long)]
         keys: PathBuf,
@@ -177,9 +177,9 @@ pub enum Verb {
     },
 }
 
-/// Who signs.
+/// How many people and keys sign releases, as `--profile` says it.
 #[derive(Clone, Copy, ValueEnum)]
-pub enum Who {
+pub enum ProfileArg {
     /// One person with one key.
     Solo,
     /// One of two keys, and a spare in a safe.
@@ -188,12 +188,12 @@ pub enum Who {
     Release,
 }
 
-impl From<Who> for Profile {
-    fn from(who: Who) -> Self {
-        match who {
-            Who::Solo => Self::Solo,
-            Who::Team => Self::Team,
-            Who::Release => Self::Release,
+impl From<ProfileArg> for Profile {
+    fn from(profile: ProfileArg) -> Self {
+        match profile {
+            ProfileArg::Solo => Self::Solo,
+            ProfileArg::Team => Self::Team,
+            ProfileArg::Release => Self::Release,
         }
     }
 }
@@ -242,12 +242,12 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     }
 }
 
-fn keygen(profile: Who, keys: &Path, repository: &Path, out: &Out) -> Result<(), Exit> {
+fn keygen(profile: ProfileArg, keys: &Path, repository: &Path, out: &Out) -> Result<(), Exit> {
     Folder::create(repository, keys, profile.into(), clock::wall())?;
     let who = match profile {
-        Who::Solo => "one key signs",
-        Who::Team => "one of three keys signs; put the third into a safe",
-        Who::Release => "two of three keys must sign; give each to another person",
+        ProfileArg::Solo => "one key signs",
+        ProfileArg::Team => "one of three keys signs; put the third into a safe",
+        ProfileArg::Release => "two of three keys must sign; give each to another person",
     };
     print_json(&serde_json::json!({"keys": keys, "repository": repository, "rootVersion": 1}), out);
     out.inform(&format!("keys in {}, repository in {}: {who}", keys.display(), repository.display()));

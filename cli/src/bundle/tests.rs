@@ -10,7 +10,7 @@ struct Place {
 impl Place {
     fn new() -> Self {
         let this = Self { dir: tempfile::tempdir().expect("a folder"), out: Out::new(Format::Name) };
-        keygen(Who::Solo, &this.path("keys"), &this.path("repository"), &this.out).expect("made");
+        keygen(ProfileArg::Solo, &this.path("keys"), &this.path("repository"), &this.out).expect("made");
         this
     }
     fn path(&self, name: &str) -> PathBuf {
