@@ -3,7 +3,7 @@
 //! Invariant: default deny. A path without a rule is for nobody, whoever asks. The rules of methods are made from the descriptors when this crate is built, so
 //! that there is no second place to forget.
 
-use midshift_core::identity::{Access, Caller, Object, Permission, Who};
+use midshift_core::identity::{Access, Caller, Object, Permission, Principal};
 use midshift_core::overload::Class;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 
@@ -54,10 +54,10 @@ pub fn is_batch(path: &str) -> bool {
 pub fn check(caller: &Caller, path: &str) -> Result<(), Refusal> {
     match find(path) {
         Some(access) => caller.may_call(access),
-        None => match caller.who() {
+        None => match caller.principal() {
             // The services say themselves what is not there.
-            Who::Local => Ok(()),
-            Who::Nobody => Err(Refusal::new(Kind::Unauthenticated, Code::SignInNeeded)),
+            Principal::Local => Ok(()),
+            Principal::Nobody => Err(Refusal::new(Kind::Unauthenticated, Code::SignInNeeded)),
             _ => Err(Refusal::new(
                 Kind::Denied,
                 Reason::new(Code::NotPermitted, "no rule of this server lets anybody ask for that"),

@@ -3,7 +3,7 @@
 //! Invariant: the name is what people read. A name may come again with another token: the token tells two of them apart,
 //! and the person tells two people apart.
 
-use super::caller::{Caller, Who};
+use super::caller::{Caller, Principal};
 use super::token::TokenId;
 use std::fmt;
 use std::sync::Arc;
@@ -43,9 +43,9 @@ impl fmt::Display for Actor {
 
 impl From<&Caller> for Actor {
     fn from(caller: &Caller) -> Self {
-        let token = match caller.who() {
-            Who::Holder { token, .. } => Some(token.clone()),
-            Who::Nobody | Who::Local | Who::Robot(_) => None,
+        let token = match caller.principal() {
+            Principal::Holder { token, .. } => Some(token.clone()),
+            Principal::Nobody | Principal::Local | Principal::Robot(_) => None,
         };
         Self { name: caller.to_string().into(), token, person: caller.named_person().cloned() }
     }

@@ -1,4 +1,4 @@
-//! Who asks, and what it may.
+//! Identifies the caller of a request, and decides what it may do.
 
 use super::grant::{Access, Grant, HeldGrant, Permission, Scope};
 use super::token::{Digest, TokenId};
@@ -7,20 +7,20 @@ use crate::reason::{Code, Kind, Reason, Refusal};
 use std::fmt;
 use std::sync::Arc;
 
-/// The identity of a caller.
+/// The identity of a caller, before any of its rights.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Who {
-    /// Somebody who showed nothing.
+pub enum Principal {
+    /// A caller without a certificate and without a token.
     Nobody,
-    /// Whoever reaches a port without login (`dev`), or code of the same process that says so: may do everything.
+    /// A caller of a port without login (`dev`), or code of the same process: it may do everything.
     Local,
     /// A robot, by its certificate.
     Robot(RobotId),
     /// A person or a program, by a token.
     Holder {
-        /// Of which token.
+        /// Id of the token.
         token: TokenId,
-        /// Its name, which stands for it as an actor.
+        /// Name of the holder, under which its decisions are recorded.
         name: Arc<str>,
     },
 }
@@ -28,8 +28,8 @@ pub enum Who {
 /// The caller of a request, with its rights. Stands in the extensions of each request that came through a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Caller {
-    who: Who,
-    grants: Arc<[HeldGrant]>,
+    principal: Principal,
+    grants: Arc<[Grant]>,
     /// Its token's time is over, for less than [`crate::limits::TOKEN_STOPS_AFTER_EXPIRY`]: it may engage stops and nothing else.
     expired: bool,
     certificate: Option<Arc<str>>,
@@ -38,20 +38,20 @@ pub struct Caller {
 }
 
 impl Caller {
-    /// Somebody who showed nothing.
+    /// A caller that showed neither a certificate nor a token.
     pub fn nobody() -> Self {
-        Self::without_grants(Who::Nobody)
+        Self::without_grants(Principal::Nobody)
     }
-    /// Whoever may do everything.
+    /// A caller that may do everything.
     pub fn local() -> Self {
-        Self::without_grants(Who::Local)
+        Self::without_grants(Principal::Local)
     }
     /// A robot.
     pub fn robot(robot_id: RobotId) -> Self {
-        Self::without_grants(Who::Robot(robot_id))
+        Self::without_grants(Principal::Robot(robot_id))
     }
-    fn without_grants(who: Who) -> Self {
-        Self { who, grants: Arc::default(), expired: false, certificate: None, key: None, person: None }
+    fn without_grants(principal: Principal) -> Self {
+        Self { principal, grants: Arc::default(), expired: false, certificate: None, key: None, person: None }
     }
     /// The same with the serial number of the certificate that it showed, in hex.
     #[must_use]
@@ -64,8 +64,8 @@ impl Caller {
         Self { key: Some(key), ..self }
     }
     /// The holder of a token; of one that is `expired`, it may still engage stops.
-    pub fn holder(token: TokenId, name: Arc<str>, grants: Arc<[HeldGrant]>, expired: bool) -> Self {
-        Self { grants, expired, ..Self::without_grants(Who::Holder { token, name }) }
+    pub fn holder(token: TokenId, name: Arc<str>, grants: Arc<[Grant]>, expired: bool) -> Self {
+        Self { grants, expired, ..Self::without_grants(Principal::Holder { token, name }) }
     }
     /// The same as one person's, who may have several tokens. None: its name stands for itself.
     #[must_use]
@@ -80,9 +80,9 @@ impl Caller {
     pub fn person(&self) -> String {
         self.person.as_ref().map_or_else(|| self.to_string(), ToString::to_string)
     }
-    /// Who it is.
-    pub const fn who(&self) -> &Who {
-        &self.who
+    /// Its identity, without its rights.
+    pub const fn principal(&self) -> &Principal {
+        &self.principal
     }
     /// Serial number of the certificate that it showed, in hex; none: it showed none.
     pub const fn certificate(&self) -> Option<&Arc<str>> {
@@ -111,15 +111,15 @@ impl Caller {
     /// Not signed in, or no grant that permits it.
     pub fn may_call(&self, access: Access) -> Result<(), Refusal> {
         let permission = access.permission;
-        let allowed = match (&self.who, permission) {
-            (_, Permission::Anybody) | (Who::Local, _) => true,
-            (Who::Robot(_), needed) => matches!(needed, Permission::Robot | Permission::SignedIn),
-            (Who::Nobody, _) => return Err(Refusal::new(Kind::Unauthenticated, Code::SignInNeeded)),
-            (Who::Holder { .. }, Permission::Stop) => !self.grants.is_empty(),
-            (Who::Holder { .. }, _) if self.expired => {
+        let allowed = match (&self.principal, permission) {
+            (_, Permission::Anybody) | (Principal::Local, _) => true,
+            (Principal::Robot(_), needed) => matches!(needed, Permission::Robot | Permission::SignedIn),
+            (Principal::Nobody, _) => return Err(Refusal::new(Kind::Unauthenticated, Code::SignInNeeded)),
+            (Principal::Holder { .. }, Permission::Stop) => !self.grants.is_empty(),
+            (Principal::Holder { .. }, _) if self.expired => {
                 return Err(Refusal::new(Kind::Unauthenticated, Code::TokenExpired));
             }
-            (Who::Holder { .. }, needed) => self.known_grants().any(|grant| {
+            (Principal::Holder { .. }, needed) => self.grants.iter().any(|grant| {
                 grant.role.permits(needed) && (access.object != super::Object::Site || grant.scope == Scope::Site)
             }),
         };
@@ -129,7 +129,7 @@ impl Caller {
     /// Whether it may do that to something that lies in these areas: each of them must be in the scope of a grant that permits it, and something without any
     /// area is the site's.
     pub fn may_over<'a>(&self, permission: Permission, areas: impl IntoIterator<Item = &'a AreaId>) -> bool {
-        if matches!(self.who, Who::Local) {
+        if matches!(self.principal, Principal::Local) {
             return true;
         }
         let permits = |area: Option<&AreaId>| {
@@ -179,10 +179,10 @@ impl Caller {
     /// # Errors
     /// It is somebody else.
     pub fn is_robot(&self, robot_id: &RobotId) -> Result<(), Refusal> {
-        match &self.who {
-            Who::Local => Ok(()),
-            Who::Robot(own) if own == robot_id => Ok(()),
-            Who::Nobody => Err(Refusal::new(Kind::Unauthenticated, Code::SignInNeeded)),
+        match &self.principal {
+            Principal::Local => Ok(()),
+            Principal::Robot(own) if own == robot_id => Ok(()),
+            Principal::Nobody => Err(Refusal::new(Kind::Unauthenticated, Code::SignInNeeded)),
             _ => Err(Refusal::new(
                 Kind::Denied,
                 Reason::new(Code::NotThisRobot, format!("{self} may not speak for {robot_id}"))
@@ -200,11 +200,11 @@ impl Caller {
 /// As an actor: what decisions are recorded under.
 impl fmt::Display for Caller {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match &self.who {
-            Who::Nobody => f.write_str("nobody"),
-            Who::Local => f.write_str("anonymous"),
-            Who::Robot(robot_id) => write!(f, "robot:{robot_id}"),
-            Who::Holder { name, .. } => f.write_str(name),
+        match &self.principal {
+            Principal::Nobody => f.write_str("nobody"),
+            Principal::Local => f.write_str("anonymous"),
+            Principal::Robot(robot_id) => write!(f, "robot:{robot_id}"),
+            Principal::Holder { name, .. } => f.write_str(name),
         }
     }
 }

@@ -20,7 +20,7 @@ mod session;
 mod token;
 
 pub use actor::Actor;
-pub use caller::{Caller, Who};
+pub use caller::{Caller, Principal};
 pub use directory::{Directory, DirectoryToken};
 pub use enrolment::{Deny, EnrolmentState, Replace, RobotIdentity};
 pub use grant::{Access, Grant, HeldGrant, Object, Permission, Role, Scope};

@@ -3,7 +3,7 @@
 //! Invariant: what cannot be proven is never counted for anybody but the address that it came from.
 
 use crate::quota::network;
-use midshift_core::identity::{Caller, TokenId, Who};
+use midshift_core::identity::{Caller, Principal, TokenId};
 use midshift_core::ids::RobotId;
 use midshift_core::reason::Refusal;
 use std::fmt;
@@ -25,10 +25,10 @@ pub(crate) enum QuotaKey {
 impl QuotaKey {
     pub fn from_caller(caller: Result<&Caller, &Refusal>, address: IpAddr) -> Self {
         match caller.map(Caller::who) {
-            Ok(Who::Robot(robot_id)) => Self::Robot(robot_id.clone()),
-            Ok(Who::Holder { token, .. }) => Self::Token(token.clone()),
-            Ok(Who::Local) => Self::Network(network(address)),
-            Ok(Who::Nobody) | Err(_) => Self::Unauthenticated(network(address)),
+            Ok(Principal::Robot(robot_id)) => Self::Robot(robot_id.clone()),
+            Ok(Principal::Holder { token, .. }) => Self::Token(token.clone()),
+            Ok(Principal::Local) => Self::Network(network(address)),
+            Ok(Principal::Nobody) | Err(_) => Self::Unauthenticated(network(address)),
         }
     }
 }

@@ -17,7 +17,7 @@ use crate::unauthenticated::Unauthenticated;
 use http::{HeaderMap, Request, Response, Uri};
 use hyper::body::Incoming;
 use hyper::service::Service as HyperService;
-use midshift_core::identity::{Actor, Caller, Who};
+use midshift_core::identity::{Actor, Caller, Principal};
 use midshift_core::overload::Class;
 use midshift_core::overload::bugs::Bugs;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
@@ -190,7 +190,7 @@ impl Door {
 
     /// Tells whoever writes it down. Somebody who showed nothing was denied nothing: it is asked to sign in.
     fn denied(&self, key: &QuotaKey, caller: Option<&Caller>, path: &str, refusal: &Refusal) {
-        if caller.is_some_and(|caller| matches!(caller.who(), Who::Nobody)) {
+        if caller.is_some_and(|caller| matches!(caller.principal(), Principal::Nobody)) {
             return;
         }
         let (actor, from) = (Actor::from(caller.unwrap_or(&Caller::nobody())), network(self.peer.address.ip()));

@@ -6,7 +6,7 @@ use crate::tokens::rotate::{self, Turn};
 use crate::tokens::{self, Wanted};
 use crate::{Error, IdentityService, encode};
 use midshift_core::audit::Note;
-use midshift_core::identity::{Caller, Replace, RobotIdentity, Secret, TokenId, Who};
+use midshift_core::identity::{Caller, Principal, Replace, RobotIdentity, Secret, TokenId};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
@@ -267,8 +267,8 @@ fn unavailable() -> Refusal {
 impl IdentityFace for IdentityService {
     async fn who_am_i(&self, request: Request<v1::WhoAmIRequest>) -> Result<Response<v1::WhoAmIResponse>, Status> {
         let caller = caller(&request);
-        let token_id = match caller.who() {
-            Who::Holder { token, .. } => token.to_string(),
+        let token_id = match caller.principal() {
+            Principal::Holder { token, .. } => token.to_string(),
             _ => String::new(),
         };
         Ok(Response::new(v1::WhoAmIResponse {

@@ -8,7 +8,7 @@ use crate::integrity::Integrity;
 use crate::refusal::{answer, status};
 use crate::repository::Documents;
 use midshift_bundle::digest::Digest;
-use midshift_core::identity::{Caller, RobotIdentity, Who};
+use midshift_core::identity::{Caller, Principal, RobotIdentity};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_proto::access::caller;
@@ -63,7 +63,9 @@ impl Downloads {
 
     /// Refuses a machine that shows a certificate of the site and is not enrolled as the robot that it names. Whoever shows none is the port's to judge.
     pub(crate) async fn must_be_enrolled(&self, by: &Caller) -> Result<(), Refusal> {
-        let (Some(rows), Who::Robot(robot_id), Some(key)) = (&self.rows, by.who(), by.key()) else { return Ok(()) };
+        let (Some(rows), Principal::Robot(robot_id), Some(key)) = (&self.rows, by.principal(), by.key()) else {
+            return Ok(());
+        };
         let found = load::<RobotIdentity>(rows.as_ref(), robot_id.as_str()).await;
         let unavailable = |error: midshift_store::Error| {
             Refusal::new(Kind::Unavailable, Reason::new(Code::StoreUnavailable, error.to_string()))

@@ -5,7 +5,7 @@
 
 use super::dry_run::find_superseded;
 use crate::fleet::Board;
-use crate::identity::{Caller, Permission, Who};
+use crate::identity::{Caller, Permission, Principal};
 use crate::ids::{RobotId, RolloutId};
 use crate::reason::{Code, Kind, Reason, Refusal};
 use crate::rollout::projection::requests::{Command, Verb};
@@ -111,7 +111,7 @@ fn acts_on_robot(
 /// Refuses a person that wrote the roll-out itself. Where nobody signs in there is nobody else.
 fn needs_another_person(view: &RolloutProjection, by: &Caller, rollout_id: &RolloutId) -> Result<(), Refusal> {
     let Some(rollout) = view.rollout(rollout_id) else { return Ok(()) };
-    if matches!(by.who(), Who::Local) || rollout.created.person() != by.person() {
+    if matches!(by.principal(), Principal::Local) || rollout.created.person() != by.person() {
         return Ok(());
     }
     Err(Refusal::new(Kind::Denied, Reason::from(Code::NotYourOwn).with("rollout_id", rollout_id)))

@@ -2,7 +2,7 @@
 
 use crate::tokens::{create, holder, list, revoke};
 use crate::world::{World, asked_by, code};
-use midshift_core::identity::{Caller, Digest, TokenId, TokenRecord, Who};
+use midshift_core::identity::{Caller, Digest, Principal, TokenId, TokenRecord};
 use midshift_core::reason::Code;
 use midshift_core::rows::{Item, Writer};
 use midshift_identity::IdentityService;
@@ -151,8 +151,8 @@ async fn what_the_holder_of_a_token_decided_has_the_token_s_id_in_the_audit() {
 }
 
 fn row_id(caller: &Caller) -> String {
-    match caller.who() {
-        Who::Holder { token, .. } => token.to_string(),
+    match caller.principal() {
+        Principal::Holder { token, .. } => token.to_string(),
         _ => String::new(),
     }
 }
