@@ -63,9 +63,9 @@ leader_rows! {
     OtaLeader OtaLeader "ota";
 }
 
-/// Who else may lead.
+/// Says whether other processes may contend for the lease.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Rivals {
+pub enum Contenders {
     /// The store opens for one process: whoever holds the row when this one starts is dead.
     None,
     /// Other processes on the same store.
@@ -74,9 +74,9 @@ pub enum Rivals {
     Ignored,
 }
 
-/// What a process does at this moment.
+/// What a process does about its lease at this moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Stance {
+pub enum LeaseAction {
     /// It leads, and the row needs no write.
     Lead,
     /// It leads, and writes the row again.
@@ -89,9 +89,9 @@ pub enum Stance {
     StepDown,
 }
 
-/// What a process believes of itself.
+/// The role that a process believes it has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Part {
+pub enum LeaderRole {
     /// It leads. Since when its newest claim counts: a reading of its link clock from before that was committed.
     Leads(LinkTime),
     /// It does not.
@@ -113,39 +113,41 @@ pub struct Seen {
     pub from_before: bool,
 }
 
-/// The law: what the process `me` does at `now`.
-pub fn decide(me: &str, part: Part, seen: &Seen, rivals: Rivals, now: LinkTime) -> Stance {
-    let mine = seen.holder == me;
-    match (part, rivals) {
-        (_, Rivals::Ignored) => Stance::Lead,
-        (Part::Leads(_), _) if !mine => Stance::StepDown,
-        (Part::Leads(_), Rivals::None) => Stance::Lead,
-        (Part::Leads(renewed), Rivals::Some) => match now.since(renewed) {
-            age if age >= limits::LEAD_ENDS_AFTER => Stance::StepDown,
-            age if age >= limits::LEAD_RENEWED_EVERY => Stance::Renew,
-            _ => Stance::Lead,
+/// Decides what the process `own_id` does about the lease at `now`.
+pub fn decide(own_id: &str, role: LeaderRole, seen: &Seen, contenders: Contenders, now: LinkTime) -> LeaseAction {
+    let mine = seen.holder == own_id;
+    match (role, contenders) {
+        (_, Contenders::Ignored) => LeaseAction::Lead,
+        (LeaderRole::Leads(_), _) if !mine => LeaseAction::StepDown,
+        (LeaderRole::Leads(_), Contenders::None) => LeaseAction::Lead,
+        (LeaderRole::Leads(renewed), Contenders::Some) => match now.since(renewed) {
+            age if age >= limits::LEAD_ENDS_AFTER => LeaseAction::StepDown,
+            age if age >= limits::LEAD_RENEWED_EVERY => LeaseAction::Renew,
+            _ => LeaseAction::Lead,
         },
-        (Part::StandsBy, _) if mine || seen.holder.is_empty() => Stance::TakeOver,
-        (Part::StandsBy, Rivals::None) if seen.from_before => Stance::TakeOver,
-        (Part::StandsBy, Rivals::Some) if now.since(seen.since) >= limits::LEAD_FREE_AFTER => Stance::TakeOver,
-        (Part::StandsBy, _) => Stance::StandBy,
+        (LeaderRole::StandsBy, _) if mine || seen.holder.is_empty() => LeaseAction::TakeOver,
+        (LeaderRole::StandsBy, Contenders::None) if seen.from_before => LeaseAction::TakeOver,
+        (LeaderRole::StandsBy, Contenders::Some) if now.since(seen.since) >= limits::LEAD_FREE_AFTER => {
+            LeaseAction::TakeOver
+        }
+        (LeaderRole::StandsBy, _) => LeaseAction::StandBy,
     }
 }
 
-/// The place of one process: what it has seen of the row, and whether it leads.
+/// The leader lease as one process sees it: the row that it read last, and whether it leads.
 #[derive(Clone, Debug)]
-pub struct Seat<R> {
-    me: String,
-    rivals: Rivals,
-    part: Part,
+pub struct LeaderLease<R> {
+    own_id: String,
+    contenders: Contenders,
+    role: LeaderRole,
     seen: Option<Seen>,
     row: PhantomData<R>,
 }
 
-impl<R: LeaderRow> Seat<R> {
-    /// The place of the process `me`, which has seen nothing yet.
-    pub const fn new(me: String, rivals: Rivals) -> Self {
-        Self { me, rivals, part: Part::StandsBy, seen: None, row: PhantomData }
+impl<R: LeaderRow> LeaderLease<R> {
+    /// The lease as the process `own_id` sees it, which has read nothing yet.
+    pub const fn new(own_id: String, contenders: Contenders) -> Self {
+        Self { own_id, contenders, role: LeaderRole::StandsBy, seen: None, row: PhantomData }
     }
     /// Name of the row.
     pub fn key() -> Key {
@@ -153,7 +155,7 @@ impl<R: LeaderRow> Seat<R> {
     }
     /// Whether this process decides.
     pub fn leads(&self) -> bool {
-        matches!(self.part, Part::Leads(_)) || self.rivals == Rivals::Ignored
+        matches!(self.role, LeaderRole::Leads(_)) || self.contenders == Contenders::Ignored
     }
     /// Takes the row as it was read at `now`; none: there is no row.
     ///
@@ -188,33 +190,33 @@ impl<R: LeaderRow> Seat<R> {
         newest.map_or(Ok(()), |row| self.read(Some(&row), now))
     }
     /// What to do at `now`. Before the row was read nobody leads.
-    pub fn stance(&self, now: LinkTime) -> Stance {
+    pub fn next_action(&self, now: LinkTime) -> LeaseAction {
         match &self.seen {
-            Some(seen) => decide(&self.me, self.part, seen, self.rivals, now),
-            None if self.rivals == Rivals::Ignored => Stance::Lead,
-            None => Stance::StandBy,
+            Some(seen) => decide(&self.own_id, self.role, seen, self.contenders, now),
+            None if self.contenders == Contenders::Ignored => LeaseAction::Lead,
+            None => LeaseAction::StandBy,
         }
     }
     /// The item that takes over or renews. It conflicts if anybody else wrote the row since it was seen.
     pub fn claim(&self) -> Item {
-        self.write(self.me.clone(), if self.leads() { "lead.renewed" } else { "lead.taken" })
+        self.write(self.own_id.clone(), if self.leads() { "lead.renewed" } else { "lead.taken" })
     }
     /// The claim that was made from a reading of the clock at `at` is committed.
     pub fn claimed(&mut self, at: LinkTime) {
         let seen = self.seen.as_ref();
         let (revision, beat) = seen.map_or((Revision(0), 0), |s| (s.revision, s.beat));
         let (revision, beat) = (revision.next(), beat + 1);
-        self.seen = Some(Seen { holder: self.me.clone(), beat, revision, since: at, from_before: false });
-        self.part = Part::Leads(at);
+        self.seen = Some(Seen { holder: self.own_id.clone(), beat, revision, since: at, from_before: false });
+        self.role = LeaderRole::Leads(at);
     }
     /// The item that lets another one lead at once; none: this process does not lead, or there is no other.
     pub fn release(&self) -> Option<Item> {
-        (matches!(self.part, Part::Leads(_)) && self.rivals == Rivals::Some)
+        (matches!(self.role, LeaderRole::Leads(_)) && self.contenders == Contenders::Some)
             .then(|| self.write(String::new(), "lead.left"))
     }
     /// It does not lead any more.
     pub const fn step_down(&mut self) {
-        self.part = Part::StandsBy;
+        self.role = LeaderRole::StandsBy;
     }
     fn write(&self, holder: String, kind: &'static str) -> Item {
         let (beat, revision) = self.seen.as_ref().map_or((0, Revision(0)), |s| (s.beat, s.revision));
@@ -226,14 +228,14 @@ impl<R: LeaderRow> Seat<R> {
     }
 }
 
-/// Entries of a service's own log that this process wrote: what else is in it, another process did.
+/// Remembers which entries of a service's log this process wrote: all others are another process' own.
 #[derive(Debug, Default)]
-pub struct Own {
+pub struct OwnEntries {
     /// First and last number of each item, rising.
     ranges: VecDeque<(u64, u64)>,
 }
 
-impl Own {
+impl OwnEntries {
     /// An item of so many entries was applied, the last of which is `last`.
     pub fn wrote(&mut self, last: u64, entries: u64) {
         if entries > 0 {
@@ -263,30 +265,79 @@ mod tests {
     }
 
     #[test]
-    fn the_law_of_the_lease() {
-        use Stance::{Lead, Renew, StandBy, StepDown, TakeOver};
-        let table: &[(&str, Part, Seen, Rivals, u64, Stance)] = &[
-            ("no row", Part::StandsBy, seen("", 0, true), Rivals::Some, 0, TakeOver),
-            ("an empty row", Part::StandsBy, seen("", 900, false), Rivals::Some, 900, TakeOver),
-            ("somebody leads", Part::StandsBy, seen("b", 0, true), Rivals::Some, 3_999, StandBy),
-            ("somebody led", Part::StandsBy, seen("b", 0, true), Rivals::Some, 4_000, TakeOver),
-            ("somebody led, seen late", Part::StandsBy, seen("b", 60_000, false), Rivals::Some, 63_999, StandBy),
-            ("a dead one's file", Part::StandsBy, seen("b", 0, true), Rivals::None, 0, TakeOver),
-            ("taken by one that came later", Part::StandsBy, seen("b", 5, false), Rivals::None, 99_999, StandBy),
-            ("own, not led", Part::StandsBy, seen("a", 0, false), Rivals::Some, 1, TakeOver),
-            ("renewed now", Part::Leads(LinkTime(0)), seen("a", 0, false), Rivals::Some, 999, Lead),
-            ("renewed a second ago", Part::Leads(LinkTime(0)), seen("a", 0, false), Rivals::Some, 1_000, Renew),
-            ("not renewed in vain", Part::Leads(LinkTime(0)), seen("a", 0, false), Rivals::Some, 2_999, Renew),
-            ("could not renew", Part::Leads(LinkTime(0)), seen("a", 0, false), Rivals::Some, 3_000, StepDown),
-            ("frozen for a minute", Part::Leads(LinkTime(0)), seen("a", 0, false), Rivals::Some, 60_000, StepDown),
-            ("taken over", Part::Leads(LinkTime(9_900)), seen("b", 9_950, false), Rivals::Some, 9_950, StepDown),
-            ("left by itself", Part::Leads(LinkTime(0)), seen("", 10, false), Rivals::Some, 10, StepDown),
-            ("alone for an hour", Part::Leads(LinkTime(0)), seen("a", 0, false), Rivals::None, 3_600_000, Lead),
-            ("alone no more", Part::Leads(LinkTime(0)), seen("b", 5, false), Rivals::None, 5, StepDown),
-            ("naive", Part::StandsBy, seen("b", 0, true), Rivals::Ignored, 0, Lead),
+    fn the_table_of_the_lease() {
+        use LeaseAction::{Lead, Renew, StandBy, StepDown, TakeOver};
+        let table: &[(&str, LeaderRole, Seen, Contenders, u64, LeaseAction)] = &[
+            ("no row", LeaderRole::StandsBy, seen("", 0, true), Contenders::Some, 0, TakeOver),
+            ("an empty row", LeaderRole::StandsBy, seen("", 900, false), Contenders::Some, 900, TakeOver),
+            ("somebody leads", LeaderRole::StandsBy, seen("b", 0, true), Contenders::Some, 3_999, StandBy),
+            ("somebody led", LeaderRole::StandsBy, seen("b", 0, true), Contenders::Some, 4_000, TakeOver),
+            (
+                "somebody led, seen late",
+                LeaderRole::StandsBy,
+                seen("b", 60_000, false),
+                Contenders::Some,
+                63_999,
+                StandBy,
+            ),
+            ("a dead one's file", LeaderRole::StandsBy, seen("b", 0, true), Contenders::None, 0, TakeOver),
+            (
+                "taken by one that came later",
+                LeaderRole::StandsBy,
+                seen("b", 5, false),
+                Contenders::None,
+                99_999,
+                StandBy,
+            ),
+            ("own, not led", LeaderRole::StandsBy, seen("a", 0, false), Contenders::Some, 1, TakeOver),
+            ("renewed now", LeaderRole::Leads(LinkTime(0)), seen("a", 0, false), Contenders::Some, 999, Lead),
+            (
+                "renewed a second ago",
+                LeaderRole::Leads(LinkTime(0)),
+                seen("a", 0, false),
+                Contenders::Some,
+                1_000,
+                Renew,
+            ),
+            (
+                "not renewed in vain",
+                LeaderRole::Leads(LinkTime(0)),
+                seen("a", 0, false),
+                Contenders::Some,
+                2_999,
+                Renew,
+            ),
+            ("could not renew", LeaderRole::Leads(LinkTime(0)), seen("a", 0, false), Contenders::Some, 3_000, StepDown),
+            (
+                "frozen for a minute",
+                LeaderRole::Leads(LinkTime(0)),
+                seen("a", 0, false),
+                Contenders::Some,
+                60_000,
+                StepDown,
+            ),
+            (
+                "taken over",
+                LeaderRole::Leads(LinkTime(9_900)),
+                seen("b", 9_950, false),
+                Contenders::Some,
+                9_950,
+                StepDown,
+            ),
+            ("left by itself", LeaderRole::Leads(LinkTime(0)), seen("", 10, false), Contenders::Some, 10, StepDown),
+            (
+                "alone for an hour",
+                LeaderRole::Leads(LinkTime(0)),
+                seen("a", 0, false),
+                Contenders::None,
+                3_600_000,
+                Lead,
+            ),
+            ("alone no more", LeaderRole::Leads(LinkTime(0)), seen("b", 5, false), Contenders::None, 5, StepDown),
+            ("naive", LeaderRole::StandsBy, seen("b", 0, true), Contenders::Ignored, 0, Lead),
         ];
-        for (what, part, seen, rivals, now, stance) in table {
-            assert_eq!(decide("a", *part, seen, *rivals, LinkTime(*now)), *stance, "{what}");
+        for (what, role, seen, contenders, now, next_action) in table {
+            assert_eq!(decide("a", *role, seen, *contenders, LinkTime(*now)), *next_action, "{what}");
         }
     }
 
@@ -305,45 +356,48 @@ mod tests {
 
     #[test]
     fn a_leader_frozen_for_a_minute_finds_another_one_in_its_place() {
-        let mut a = Seat::<FleetLeader>::new("a".to_owned(), Rivals::Some);
-        let mut b = Seat::<FleetLeader>::new("b".to_owned(), Rivals::Some);
+        let mut a = LeaderLease::<FleetLeader>::new("a".to_owned(), Contenders::Some);
+        let mut b = LeaderLease::<FleetLeader>::new("b".to_owned(), Contenders::Some);
         a.read(None, LinkTime(0)).expect("no row");
-        assert_eq!(a.stance(LinkTime(0)), Stance::TakeOver);
+        assert_eq!(a.next_action(LinkTime(0)), LeaseAction::TakeOver);
         let first = a.claim();
         assert_eq!(first.rows[0].expect, Expect::Absent);
         a.claimed(LinkTime(0));
         // Another machine, another clock.
         b.read(Some(&row(&first, 1)), LinkTime(500_000)).expect("a row");
-        assert_eq!(b.stance(LinkTime(500_000)), Stance::StandBy);
+        assert_eq!(b.next_action(LinkTime(500_000)), LeaseAction::StandBy);
         let stale = a.claim();
         let second = b.claim();
-        assert_eq!((b.stance(LinkTime(504_000)), second.rows[0].expect), (Stance::TakeOver, Expect::At(Revision(1))));
+        assert_eq!(
+            (b.next_action(LinkTime(504_000)), second.rows[0].expect),
+            (LeaseAction::TakeOver, Expect::At(Revision(1)))
+        );
         b.claimed(LinkTime(504_000));
         assert_eq!(stale.rows[0].expect, Expect::At(Revision(1)), "what it wanted to write conflicts");
-        assert_eq!(a.stance(LinkTime(60_000)), Stance::StepDown);
+        assert_eq!(a.next_action(LinkTime(60_000)), LeaseAction::StepDown);
         a.step_down();
         a.read(Some(&row(&second, 2)), LinkTime(60_000)).expect("a row");
-        assert_eq!(a.stance(LinkTime(60_000)), Stance::StandBy);
+        assert_eq!(a.next_action(LinkTime(60_000)), LeaseAction::StandBy);
         // It leaves, and the other one need not wait.
         let left = b.release().expect("it leads");
         a.read(Some(&row(&left, 3)), LinkTime(60_001)).expect("a row");
-        assert_eq!(a.stance(LinkTime(60_001)), Stance::TakeOver);
+        assert_eq!(a.next_action(LinkTime(60_001)), LeaseAction::TakeOver);
     }
 
     #[test]
     fn whoever_saw_an_older_revision_again_learns_nothing_from_it() {
-        let mut a = Seat::<OtaLeader>::new("a".to_owned(), Rivals::Some);
+        let mut a = LeaderLease::<OtaLeader>::new("a".to_owned(), Contenders::Some);
         a.read(None, LinkTime(0)).expect("no row");
         let first = row(&a.claim(), 1);
         a.claimed(LinkTime(1_000));
         a.read(Some(&first), LinkTime(1_500)).expect("its own");
-        assert_eq!(a.stance(LinkTime(1_900)), Stance::Lead);
-        assert_eq!(a.stance(LinkTime(2_000)), Stance::Renew);
+        assert_eq!(a.next_action(LinkTime(1_900)), LeaseAction::Lead);
+        assert_eq!(a.next_action(LinkTime(2_000)), LeaseAction::Renew);
     }
 
     #[test]
     fn what_another_process_wrote_between_two_items_is_told_apart() {
-        let mut own = Own::default();
+        let mut own = OwnEntries::default();
         own.wrote(12, 3);
         own.wrote(20, 1);
         own.wrote(20, 0);

@@ -45,7 +45,7 @@ pub use tasks::load;
 pub use traffic::starts;
 
 use crate::ids::RobotId;
-use crate::leadership::Rivals;
+use crate::leadership::Contenders;
 use crate::time::Now;
 use assignment::{assign, errands, readiness};
 use decision::plan::mark;
@@ -57,12 +57,12 @@ use projection::state::FleetProjection;
 use tasks::arrivals;
 use traffic::{allocation, closed_places, desired};
 
-/// Who else may plan on a store that other processes open too, or not.
-pub fn rivals(is_shared: bool, bugs: bugs::Bugs) -> Rivals {
+/// Says whether other processes may contend for the lease of fleet's planner.
+pub fn contenders(is_shared: bool, bugs: bugs::Bugs) -> Contenders {
     match (bugs.everybody_leads(), is_shared) {
-        (true, _) => Rivals::Ignored,
-        (false, true) => Rivals::Some,
-        (false, false) => Rivals::None,
+        (true, _) => Contenders::Ignored,
+        (false, true) => Contenders::Some,
+        (false, false) => Contenders::None,
     }
 }
 

@@ -40,13 +40,13 @@ pub use facts::feed::{LOGS, absorb, follow_rows, obeyed, reread, tell_damaged};
 pub use judgement::verdict;
 pub use projection::{ended, requests, retention, rows, spec, timestamp};
 
-use crate::leadership::Rivals;
+use crate::leadership::Contenders;
 
-/// Who else may plan on a store that other processes open too, or not.
-pub fn rivals(is_shared: bool, bugs: bugs::Bugs) -> Rivals {
+/// Says whether other processes may contend for the lease of the rollout planner.
+pub fn contenders(is_shared: bool, bugs: bugs::Bugs) -> Contenders {
     match (bugs.everybody_leads(), is_shared) {
-        (true, _) => Rivals::Ignored,
-        (false, true) => Rivals::Some,
-        (false, false) => Rivals::None,
+        (true, _) => Contenders::Ignored,
+        (false, true) => Contenders::Some,
+        (false, false) => Contenders::None,
     }
 }

@@ -50,7 +50,7 @@ impl Loop {
         let sent: Vec<Sent> = items.iter().map(Sent::from_item).collect();
         let mut results = if items.is_empty() { Vec::new() } else { self.parts.store.commit(items).await };
         if renews && results.first().is_some_and(Result::is_ok) {
-            self.seat.claimed(now.link);
+            self.lease.claimed(now.link);
         }
         let lost = self.count(&results, &sent, renews);
         let results = results.split_off(usize::from(renews));

@@ -11,7 +11,7 @@ use midshift_core::fleet::projection::{self, FleetProjection};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, explain, found, maps, objects};
 use midshift_core::idempotency;
 use midshift_core::identity::Actor;
-use midshift_core::leadership::{FleetLeader, Own, Seat, Stance};
+use midshift_core::leadership::{FleetLeader, LeaderLease, LeaseAction, OwnEntries};
 use midshift_core::limits;
 use midshift_core::projection::entries_of;
 use midshift_core::reason::{Code, Kind, Refusal};
@@ -47,9 +47,9 @@ pub(crate) struct Loop {
     /// Questions that are answered once what they would see is committed.
     pub(crate) looks: Vec<Look>,
     /// Whether this process leads.
-    pub(crate) seat: Seat<FleetLeader>,
+    pub(crate) lease: LeaderLease<FleetLeader>,
     /// What this process wrote and has not read again.
-    pub(crate) own: Own,
+    pub(crate) own: OwnEntries,
     /// When the next sweep is due.
     sweep_due: Instant,
     /// Head of the feed up to which this process reads before it plans; none: it has read it.
@@ -86,7 +86,7 @@ pub async fn run(
         true => format!("{:032x}", rand::random::<u128>()),
         false => format!("alone-{}", parts.clock.now().wall.0),
     };
-    let seat = Seat::new(me, midshift_core::fleet::rivals(parts.store.is_shared(), parts.bugs));
+    let lease = LeaderLease::new(me, midshift_core::fleet::contenders(parts.store.is_shared(), parts.bugs));
     metrics::gauge!("midshift_fleet_leads").set(0);
     let mut this = Loop {
         parts,
@@ -98,8 +98,8 @@ pub async fn run(
         rested: Instant::now(),
         heard_up_to: 0,
         looks: Vec::new(),
-        seat,
-        own: Own::default(),
+        lease,
+        own: OwnEntries::default(),
         sweep_due: Instant::now(),
         behind: None,
         news: false,
@@ -135,7 +135,7 @@ pub async fn run(
             this.answer(this.parts.clock.now());
         }
     }
-    this.hand_over().await;
+    this.release_lease().await;
     this.outdated.map_or(Ok(()), Err)
 }
 
@@ -178,10 +178,11 @@ impl Loop {
     }
 
     /// Reads who leads, and takes over if nobody does.
-    async fn take_part(&mut self) -> Result<(), Error> {
-        let led = self.seat.leads();
-        let began = leadership::take_part(&mut self.seat, self.parts.store.as_ref(), self.parts.clock.as_ref()).await;
-        if led && !self.seat.leads() {
+    async fn claim_if_free(&mut self) -> Result<(), Error> {
+        let led = self.lease.leads();
+        let began =
+            leadership::claim_if_free(&mut self.lease, self.parts.store.as_ref(), self.parts.clock.as_ref()).await;
+        if led && !self.lease.leads() {
             leads_no_more();
         }
         if began? {
@@ -202,8 +203,8 @@ impl Loop {
     }
 
     /// Lets another process lead at once, if this one does.
-    async fn hand_over(&mut self) {
-        let Some(is_said) = leadership::hand_over(&mut self.seat, self.parts.store.as_ref()).await else { return };
+    async fn release_lease(&mut self) {
+        let Some(is_said) = leadership::release_lease(&mut self.lease, self.parts.store.as_ref()).await else { return };
         if !is_said {
             tracing::warn!("another process will lead fleet only after a while: this one could not say that it ends");
         }
@@ -212,12 +213,12 @@ impl Loop {
 
     /// Builds the projection from nothing and takes what was not consumed yet. A process that leads makes sure that it may plan on its map.
     pub(crate) async fn rebuild(&mut self) -> Result<(), Error> {
-        self.take_part().await?;
+        self.claim_if_free().await?;
         self.own.clear();
-        let Self { seat, parts, .. } = self;
+        let Self { lease, parts, .. } = self;
         let alive = projection::alive();
         let reading = parts.store.read(&alive, projection::named);
-        let snapshot = leadership::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
+        let snapshot = leadership::renew_while(lease, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
         let now = self.parts.clock.now();
         let served = self.view.serving(&now);
         let mut next = FleetProjection::new(self.parts.site.clone(), self.started, now);
@@ -234,10 +235,10 @@ impl Loop {
         let stored = self.view.sites.get(self.parts.site.site_id().as_str()).map(|s| &s.row.text);
         let at_start = self.at_start.get_or_init(|| stored.cloned());
         let Parts { site_text, map, .. } = &self.parts;
-        if self.seat.leads() {
+        if self.lease.leads() {
             self.outdated = maps::outdated(&self.view, site_text, at_start.as_deref(), map).map(MapOutdated);
         }
-        if !self.seat.leads() || self.outdated.is_some() {
+        if !self.lease.leads() || self.outdated.is_some() {
             self.seq = snapshot.seq;
             self.view.rest();
             return Ok(());
@@ -259,16 +260,16 @@ impl Loop {
         self.read_board();
         let unreadable = |error| tracing::warn!(%error, "fleet cannot read the store");
         // What the clock says comes first: a process that was away decides nothing before it has read who leads.
-        if self.seat.stance(self.parts.clock.now().link) == Stance::StepDown {
+        if self.lease.next_action(self.parts.clock.now().link) == LeaseAction::StepDown {
             self.rebuild().await.map_err(unreadable)?;
         }
-        if !self.seat.leads() {
+        if !self.lease.leads() {
             self.sweep_due = Instant::now() + Duration::from_millis(limits::SWEEP.as_ms());
             (self.behind, self.more) = (None, false);
             let begun = Instant::now();
             self.follow_rows().await.map_err(unreadable)?;
             self.rest_after(begun.elapsed());
-            if self.seat.stance(self.parts.clock.now().link) == Stance::TakeOver {
+            if self.lease.next_action(self.parts.clock.now().link) == LeaseAction::TakeOver {
                 self.rebuild().await.map_err(unreadable)?;
             }
         }
@@ -276,7 +277,7 @@ impl Loop {
             // Whoever asked hears that this process ends.
             return Ok(());
         }
-        if self.seat.leads() { self.lead(pace, requests).await } else { self.assist(requests).await }
+        if self.lease.leads() { self.lead(pace, requests).await } else { self.assist(requests).await }
     }
 
     fn rest_after(&mut self, took: Duration) {
@@ -308,14 +309,14 @@ impl Loop {
         self.take_feed(now, &mut plan).await.map_err(|error| tracing::warn!(%error, "fleet cannot read the feed"))?;
         let unread = |error| tracing::warn!(%error, "fleet cannot read what is over");
         self.ask(used_ids(&requests)).await.map_err(unread)?;
-        let renewal = match self.seat.stance(now.link) {
-            Stance::StepDown => {
+        let renewal = match self.lease.next_action(now.link) {
+            LeaseAction::StepDown => {
                 // What was planned a moment ago is dropped, and with it the projection that holds it.
                 self.rebuild().await.map_err(|error| tracing::warn!(%error, "fleet cannot read the store"))?;
                 return self.assist(requests).await;
             }
-            Stance::Renew => Some(self.seat.claim()),
-            Stance::Lead | Stance::StandBy | Stance::TakeOver => None,
+            LeaseAction::Renew => Some(self.lease.claim()),
+            LeaseAction::Lead | LeaseAction::StandBy | LeaseAction::TakeOver => None,
         };
         let replies = self.take_requests(requests, now, &mut plan);
         let is_due = self.news || self.more || !replies.is_empty() || pace == Pace::Sweep;
@@ -394,7 +395,7 @@ impl Loop {
                 let is_own = entry.log == Log::Fleet && self.own.is_own(entry.seq.0);
                 self.news |= !is_lease && !is_own;
             }
-            self.seat.follow(some, clock.now().link)?;
+            self.lease.follow(some, clock.now().link)?;
             absorb(&mut self.view, now, &self.board, some, plan);
             if let Some(last) = some.last().filter(|_| plan.slice.is_spent()) {
                 next = last.seq.min(next);

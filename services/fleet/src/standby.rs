@@ -22,11 +22,11 @@ impl Loop {
         let mut unreadable = Vec::new();
         let mut seen = Ok(());
         let clock = self.parts.clock.clone();
-        let Self { view, seat, .. } = self;
+        let Self { view, lease, .. } = self;
         let take = |entries: &[Entry]| {
             if seen.is_ok() {
                 // Counted from when it was seen: a look may take long.
-                seen = seat.follow(entries, clock.now().link);
+                seen = lease.follow(entries, clock.now().link);
             }
             if !entries.is_empty() {
                 follow_rows(view, now, entries, &mut unreadable);

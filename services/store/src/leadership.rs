@@ -1,9 +1,9 @@
-//! Taking part in who leads a service: the rules are [`midshift_core::leadership`], and this reads and writes its row.
+//! Reads and writes the leader lease of a service in the store, by the rules of [`midshift_core::leadership`].
 //!
 //! Invariant: what was read counts from after the reading, since an answer may take long; what was claimed counts from before the claim.
 
 use crate::{Applied, CommitError, Error, Store};
-use midshift_core::leadership::{LeaderRow, Seat, Stance};
+use midshift_core::leadership::{LeaderLease, LeaderRow, LeaseAction};
 use midshift_core::limits;
 use midshift_core::time::Clock;
 use std::pin::pin;
@@ -13,39 +13,43 @@ use std::time::Duration;
 /// How often a process that reads looks whether its lease is due.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
 
-/// Reads who leads, and takes over if nobody does; true: this process leads from now on. It may have stepped down, also before an error.
+/// Reads the lease and claims it if no process leads; true: this process leads from now on. It may have stepped down, also before an error.
 ///
 /// # Errors
 /// If the row cannot be read, or nobody knows whether it was written.
-pub async fn take_part<R: LeaderRow>(seat: &mut Seat<R>, store: &dyn Store, clock: &dyn Clock) -> Result<bool, Error> {
-    if seat.stance(clock.now().link) == Stance::StepDown {
-        seat.step_down();
+pub async fn claim_if_free<R: LeaderRow>(
+    lease: &mut LeaderLease<R>,
+    store: &dyn Store,
+    clock: &dyn Clock,
+) -> Result<bool, Error> {
+    if lease.next_action(clock.now().link) == LeaseAction::StepDown {
+        lease.step_down();
     }
-    let rows = store.get(vec![Seat::<R>::key()]).await?;
+    let rows = store.get(vec![LeaderLease::<R>::key()]).await?;
     let now = clock.now().link;
-    seat.read(rows.first(), now)?;
-    match seat.stance(now) {
-        Stance::StepDown => {
-            seat.step_down();
+    lease.read(rows.first(), now)?;
+    match lease.next_action(now) {
+        LeaseAction::StepDown => {
+            lease.step_down();
             Ok(false)
         }
-        Stance::TakeOver => match store.commit(vec![seat.claim()]).await.pop() {
+        LeaseAction::TakeOver => match store.commit(vec![lease.claim()]).await.pop() {
             Some(Ok(_)) => {
-                seat.claimed(now);
+                lease.claimed(now);
                 Ok(true)
             }
             Some(Err(CommitError::Conflict { .. })) => Ok(false),
             Some(Err(error)) => Err(Error::Unavailable(Arc::new(error))),
             None => unreachable!("one result an item"),
         },
-        Stance::Lead | Stance::Renew | Stance::StandBy => Ok(false),
+        LeaseAction::Lead | LeaseAction::Renew | LeaseAction::StandBy => Ok(false),
     }
 }
 
-/// Waits for a reading and says meanwhile that this process leads, if it does: a reading that takes long is no reason for another one to take
-/// over. It says so for [`limits::LEAD_READS_FOR`] at most.
-pub async fn renewed_while<R: LeaderRow, T>(
-    seat: &mut Seat<R>,
+/// Renews the lease of a leader while it waits for a long reading, so that no other process takes over meanwhile. It does so for
+/// [`limits::LEAD_READS_FOR`] at most.
+pub async fn renew_while<R: LeaderRow, T>(
+    lease: &mut LeaderLease<R>,
     store: &dyn Store,
     clock: &dyn Clock,
     reading: impl Future<Output = T>,
@@ -59,22 +63,22 @@ pub async fn renewed_while<R: LeaderRow, T>(
             () = tokio::time::sleep(LOOK_EVERY) => {}
         }
         let now = clock.now().link;
-        if seat.stance(now) == Stance::Renew && now.since(begun) < limits::LEAD_READS_FOR {
-            let claimed = store.commit(vec![seat.claim()]).await.pop();
+        if lease.next_action(now) == LeaseAction::Renew && now.since(begun) < limits::LEAD_READS_FOR {
+            let claimed = store.commit(vec![lease.claim()]).await.pop();
             // Not written, or nobody knows: another claim finds that out, and without one the lease ends by itself.
             if matches!(claimed, Some(Ok(_))) {
-                seat.claimed(now);
+                lease.claimed(now);
             }
         }
     }
 }
 
-/// Lets another process lead at once, if this one does. None: there was nothing to leave; else whether the row says so.
-pub async fn hand_over<R: LeaderRow>(seat: &mut Seat<R>, store: &dyn Store) -> Option<bool> {
-    let item = seat.release()?;
+/// Releases the lease of a leader, so that another process leads at once. None: this process did not lead; else whether the row says so.
+pub async fn release_lease<R: LeaderRow>(lease: &mut LeaderLease<R>, store: &dyn Store) -> Option<bool> {
+    let item = lease.release()?;
     let within = Duration::from_millis(limits::LEAD_LEFT_WITHIN.as_ms());
     let left = tokio::time::timeout(within, store.commit(vec![item])).await;
-    seat.step_down();
+    lease.step_down();
     Some(left.is_ok_and(|results| results.iter().all(Result::is_ok)))
 }
 

@@ -12,7 +12,7 @@ use crate::collect::Named;
 use crate::service::OtaService;
 use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
-use midshift_core::leadership::{OtaLeader, Own, Seat, Stance};
+use midshift_core::leadership::{LeaderLease, LeaseAction, OtaLeader, OwnEntries};
 use midshift_core::limits;
 use midshift_core::projection;
 use midshift_core::reason::{Code, Kind, Refusal};
@@ -77,9 +77,9 @@ pub(super) struct Loop {
     /// Questions that are answered once what they would see is committed.
     pub(super) questions: Vec<Question>,
     /// Whether this process leads.
-    pub(super) seat: Seat<OtaLeader>,
+    pub(super) lease: LeaderLease<OtaLeader>,
     /// What this process wrote and has not read again.
-    own: Own,
+    own: OwnEntries,
     /// Commands that the next turn decides anew.
     again: Vec<Request>,
 }
@@ -113,7 +113,7 @@ async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Error>
         true => format!("{:032x}", rand::random::<u128>()),
         false => format!("alone-{}", parts.clock.now().wall.0),
     };
-    let seat = Seat::new(me, midshift_core::rollout::rivals(parts.store.is_shared(), parts.bugs));
+    let lease = LeaderLease::new(me, midshift_core::rollout::contenders(parts.store.is_shared(), parts.bugs));
     metrics::gauge!("midshift_ota_leads").set(0);
     let mut this = Loop {
         parts,
@@ -126,8 +126,8 @@ async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Error>
         changed,
         say_at_ms: 0,
         questions: Vec::new(),
-        seat,
-        own: Own::default(),
+        lease,
+        own: OwnEntries::default(),
         again: Vec::new(),
     };
     this.rebuild_until_read(&shutdown).await;
@@ -154,7 +154,7 @@ async fn run(planner: Planner, shutdown: CancellationToken) -> Result<(), Error>
             }
         }
     }
-    this.hand_over().await;
+    this.release_lease().await;
     Ok(())
 }
 
@@ -182,10 +182,11 @@ impl Loop {
     }
 
     /// Reads who leads, and takes over if nobody does.
-    async fn take_part(&mut self) -> Result<(), Error> {
-        let led = self.seat.leads();
-        let began = leadership::take_part(&mut self.seat, self.parts.store.as_ref(), self.parts.clock.as_ref()).await;
-        if led && !self.seat.leads() {
+    async fn claim_if_free(&mut self) -> Result<(), Error> {
+        let led = self.lease.leads();
+        let began =
+            leadership::claim_if_free(&mut self.lease, self.parts.store.as_ref(), self.parts.clock.as_ref()).await;
+        if led && !self.lease.leads() {
             self.lead_no_more();
         }
         if began? {
@@ -217,8 +218,8 @@ impl Loop {
     }
 
     /// Lets another process lead at once, if this one does.
-    async fn hand_over(&mut self) {
-        let Some(is_said) = leadership::hand_over(&mut self.seat, self.parts.store.as_ref()).await else { return };
+    async fn release_lease(&mut self) {
+        let Some(is_said) = leadership::release_lease(&mut self.lease, self.parts.store.as_ref()).await else { return };
         if !is_said {
             tracing::warn!(
                 "another process will lead roll-outs only after a while: this one could not say that it ends"
@@ -229,12 +230,12 @@ impl Loop {
 
     /// Builds the projection from nothing.
     pub(super) async fn rebuild(&mut self) -> Result<(), Error> {
-        self.take_part().await?;
+        self.claim_if_free().await?;
         self.own.clear();
-        let Self { seat, parts, .. } = self;
+        let Self { lease, parts, .. } = self;
         let parts_read = ended::alive();
         let reading = parts.store.read(&parts_read, ended::named);
-        let snapshot = leadership::renewed_while(seat, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
+        let snapshot = leadership::renew_while(lease, parts.store.as_ref(), parts.clock.as_ref(), reading).await?;
         let now = self.parts.clock.now();
         let served = self.view.served_ms(&now);
         let mut next = RolloutProjection::new(self.parts.site.clone(), self.started, now);
@@ -245,7 +246,7 @@ impl Loop {
         // The row is as old as the last commit; this process has served on since.
         self.view.served.site_ms = self.view.served.site_ms.max(served);
         self.seq = self.view.marks.get("ota").map_or(Seq(0), |m| m.row.seq).min(snapshot.seq);
-        if !self.seat.leads() {
+        if !self.lease.leads() {
             self.seq = snapshot.seq;
             self.view.arrived.clear();
         } else {
@@ -266,17 +267,17 @@ impl Loop {
         self.take_heartbeats();
         let unreadable = |error| tracing::warn!(%error, "roll-outs cannot read the store");
         // What the clock says comes first: a process that was away decides nothing before it has read who leads.
-        if self.seat.stance(self.parts.clock.now().link) == Stance::StepDown {
+        if self.lease.next_action(self.parts.clock.now().link) == LeaseAction::StepDown {
             self.rebuild().await.map_err(unreadable)?;
         }
-        if !self.seat.leads() {
+        if !self.lease.leads() {
             self.follow_rows().await.map_err(unreadable)?;
             self.view.let_go();
-            if self.seat.stance(self.parts.clock.now().link) == Stance::TakeOver {
+            if self.lease.next_action(self.parts.clock.now().link) == LeaseAction::TakeOver {
                 self.rebuild().await.map_err(unreadable)?;
             }
         }
-        if self.seat.leads() { self.lead(requests).await } else { self.assist(requests).await.map(|()| false) }
+        if self.lease.leads() { self.lead(requests).await } else { self.assist(requests).await.map(|()| false) }
     }
 
     /// Takes what robots said since.
@@ -300,7 +301,7 @@ impl Loop {
         let mut foreign = None;
         let mut seen = Ok(());
         let clock = self.parts.clock.clone();
-        let Self { view, seat, own, .. } = self;
+        let Self { view, lease, own, .. } = self;
         let take = |entries: &[Entry]| {
             for entry in entries.iter().filter(|e| e.log == Log::Ota) {
                 if !own.is_own(entry.seq.0) && entry.table != Some(Table::OtaLeader) {
@@ -308,7 +309,7 @@ impl Loop {
                 }
             }
             if seen.is_ok() {
-                seen = seat.follow(entries, clock.now().link);
+                seen = lease.follow(entries, clock.now().link);
             }
             absorb(view, now, entries, plan);
         };
@@ -329,14 +330,14 @@ impl Loop {
         }
         let wanted = self.wanted(&requests);
         self.read_wanted(wanted).await.map_err(unreadable)?;
-        let renewal = match self.seat.stance(now.link) {
-            Stance::StepDown => {
+        let renewal = match self.lease.next_action(now.link) {
+            LeaseAction::StepDown => {
                 // What was planned a moment ago is dropped, and with it the projection that holds it.
                 self.rebuild().await.map_err(unreadable)?;
                 return self.assist(requests).await.map(|()| false);
             }
-            Stance::Renew => Some(self.seat.claim()),
-            Stance::Lead | Stance::StandBy | Stance::TakeOver => None,
+            LeaseAction::Renew => Some(self.lease.claim()),
+            LeaseAction::Lead | LeaseAction::StandBy | LeaseAction::TakeOver => None,
         };
         let ota = self.parts.ota.clone();
         let Ok(opened) = ota.opened() else { return Ok(false) };
@@ -439,7 +440,7 @@ impl Loop {
         let about: Vec<(Option<Seq>, u64)> = items.iter().map(|i| (obeyed(i), projection::entries_of(i))).collect();
         let results = if items.is_empty() { Vec::new() } else { self.parts.store.commit(items).await };
         if renews && results.first().is_some_and(Result::is_ok) {
-            self.seat.claimed(now.link);
+            self.lease.claimed(now.link);
         }
         let mut trusted = Ok(());
         let mut newest = None;

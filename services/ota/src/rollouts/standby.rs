@@ -21,11 +21,11 @@ impl Loop {
         let now = self.parts.clock.now();
         let (mut unreadable, mut changed, mut seen) = (Vec::new(), None, Ok(()));
         let clock = self.parts.clock.clone();
-        let Self { view, seat, .. } = self;
+        let Self { view, lease, .. } = self;
         let take = |entries: &[Entry]| {
             if seen.is_ok() {
                 // Counted from when it was seen: a look may take long.
-                seen = seat.follow(entries, clock.now().link);
+                seen = lease.follow(entries, clock.now().link);
             }
             let ours = |e: &&Entry| e.log == Log::Ota && e.table != Some(Table::OtaLeader);
             changed = entries.iter().rfind(ours).map(|e| e.seq).or(changed);
