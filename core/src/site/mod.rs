@@ -4,10 +4,10 @@
 //! changes afterwards. A changed map is another `Site`. Called by fleet (routes, grants), the simulator (motion) and the
 //! operator's `map` commands.
 
+mod area_lookup;
 mod draft;
 pub mod file;
 pub mod grid;
-mod lies;
 pub mod lif;
 pub mod lint;
 mod map;
