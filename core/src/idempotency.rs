@@ -1,4 +1,4 @@
-//! Commands with a request_id: asked again with the same id and the same in every part, a command is not carried out again.
+//! Makes commands with a request_id idempotent: the same command with the same request_id is carried out once.
 //!
 //! Called by what decides on commands in `fleet` and `rollout`. Invariant: the key is written in the item that carries the command out, so that
 //! neither stands without the other. What is answered to the second is that, and how things are by then.
@@ -11,18 +11,18 @@ use crate::time::Utc;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-/// Used request_ids let go of with one command.
+/// Used request_ids that are deleted with one command.
 const FORGOTTEN_AT_ONCE: usize = 4;
 
-/// What people may ask of one service.
-pub trait Asked: Serialize + DeserializeOwned + Clone + PartialEq + Send + Sync + 'static {
+/// A command of one service that is carried out once for its request_id, however often it is sent.
+pub trait IdempotentRequest: Serialize + DeserializeOwned + Clone + PartialEq + Send + Sync + 'static {
     /// Where its used request_ids are kept.
     const KEYS: Table;
 }
 
 /// A used request_id of a command. Kept 7 days.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(bound = "C: Asked")]
+#[serde(bound = "C: IdempotentRequest")]
 pub struct CommandKey<C> {
     /// The client's request_id.
     pub id: String,
@@ -34,7 +34,7 @@ pub struct CommandKey<C> {
     pub at_unix_ms: i64,
 }
 
-impl<C: Asked> Record for CommandKey<C> {
+impl<C: IdempotentRequest> Record for CommandKey<C> {
     const TABLE: Table = C::KEYS;
     body_is_json!();
     fn id(&self) -> String {
@@ -45,11 +45,11 @@ impl<C: Asked> Record for CommandKey<C> {
     }
 }
 
-/// When this command was carried out already: the same request_id, and the same in every part. None: it was not.
+/// Says when a command with this request_id, and the same in every part, was carried out. None: it was not.
 ///
 /// # Errors
 /// The request_id was used for something else.
-pub fn done_before<C: Asked>(
+pub fn done_before<C: IdempotentRequest>(
     known: &Slot<CommandKey<C>>,
     request_id: &str,
     command: &C,
@@ -65,11 +65,11 @@ pub fn done_before<C: Asked>(
     }
 }
 
-/// As [`done_before`], of which only whether it was matters.
+/// Whether this command was carried out before, as [`done_before`] finds it.
 ///
 /// # Errors
 /// The request_id was used for something else.
-pub fn is_repeat<C: Asked>(
+pub fn is_repeat<C: IdempotentRequest>(
     known: &Slot<CommandKey<C>>,
     request_id: &str,
     command: &C,
@@ -78,9 +78,13 @@ pub fn is_repeat<C: Asked>(
     done_before(known, request_id, command, seen).map(|at| at.is_some())
 }
 
-/// Writes down that a command was carried out, and lets go of a few that are past their time.
-pub fn remember<P: Projection, C: Asked>(tx: &mut Tx<'_, P>, request_id: &str, command: &C, seen: Option<Revision>)
-where
+/// Writes down that a command was carried out, and deletes a few request_ids that are past their time.
+pub fn remember<P: Projection, C: IdempotentRequest>(
+    tx: &mut Tx<'_, P>,
+    request_id: &str,
+    command: &C,
+    seen: Option<Revision>,
+) where
     CommandKey<C>: Projected<P>,
 {
     let at_unix_ms = tx.now.wall.0;

@@ -349,7 +349,7 @@ fn block(head: &str, lines: &BTreeSet<String>) -> String {
 /// All names in what is kept as text, a block a table or type.
 fn kept() -> String {
     let types = Types::read();
-    let commands = types.tables_by("Asked");
+    let commands = types.tables_by("IdempotentRequest");
     let mut reached = BTreeSet::new();
     let mut blocks = Vec::new();
     let rows = types.tables();

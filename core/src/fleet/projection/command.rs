@@ -1,6 +1,6 @@
 //! What people ask of fleet directly, as it is kept with its request_id. What comes of it is in `commands`.
 
-use crate::idempotency::Asked;
+use crate::idempotency::IdempotentRequest;
 use crate::ids::{AttemptId, PlaceId, RobotId};
 use crate::policy::AreaPolicy;
 use crate::rows::Table;
@@ -87,6 +87,6 @@ pub enum Command {
     },
 }
 
-impl Asked for Command {
+impl IdempotentRequest for Command {
     const KEYS: Table = Table::CommandKey;
 }

@@ -122,7 +122,7 @@ impl Command {
     }
 }
 
-impl idempotency::Asked for Command {
+impl idempotency::IdempotentRequest for Command {
     const KEYS: Table = Table::OtaCommandKey;
 }
 
