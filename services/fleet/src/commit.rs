@@ -6,7 +6,7 @@
 //! 3. After a conflict, or where nobody knows what came of an item, the projection is not trusted any more.
 
 use crate::reconcile::{Loop, Replies};
-use crate::requests::{Asked, Request};
+use crate::requests::{PendingCommand, Request};
 use midshift_core::fleet::projection::named;
 use midshift_core::fleet::{Plan, obeyed, put_right, refusals};
 use midshift_core::limits;
@@ -67,7 +67,7 @@ impl Loop {
     }
 
     /// Answers a command of which these items were committed, or decides it anew.
-    fn settle(&mut self, mut asked: Box<Asked>, results: Option<&[Result<Applied, CommitError>]>) {
+    fn settle(&mut self, mut asked: Box<PendingCommand>, results: Option<&[Result<Applied, CommitError>]>) {
         asked.lost += 1;
         let answer = match results.map(leadership::settled) {
             Some(Settled::Done) => Ok(()),

@@ -26,7 +26,7 @@ use midshift_core::site::Site;
 use midshift_core::time::Now;
 use midshift_proto::fleet::v1::fleet_service_server::FleetServiceServer;
 use midshift_store::Store;
-use requests::{Asked, Request};
+use requests::{PendingCommand, Request};
 use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
@@ -97,7 +97,7 @@ impl FleetService {
         request_id: Option<String>,
     ) -> Result<(), Refusal> {
         let (reply, answer) = oneshot::channel();
-        let asked = Asked { command, seen, validate_only, by: by.clone(), request_id, reply, lost: 0 };
+        let asked = PendingCommand { command, seen, validate_only, by: by.clone(), request_id, reply, lost: 0 };
         self.send(Request::Do(Box::new(asked))).await?;
         answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::CommitUnknown))?
     }

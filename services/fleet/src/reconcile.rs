@@ -6,7 +6,7 @@
 //! Invariant: the view has absorbed the feed up to a head of it before anything is planned on it, never a part of a commit; only a process that leads plans, and one that could not
 //! say so for a while reads the rows again before it does.
 
-use crate::requests::{Asked, Look, MapOutdated, Parts, Request};
+use crate::requests::{Look, MapOutdated, Parts, PendingCommand, Request};
 use midshift_core::fleet::projection::{self, FleetProjection};
 use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, explain, found, maps, objects};
 use midshift_core::idempotency;
@@ -69,7 +69,7 @@ pub(crate) struct Loop {
 }
 
 /// Commands, and the items of a plan that must be committed before each is answered.
-pub(crate) type Replies = Vec<(Box<Asked>, Range<usize>)>;
+pub(crate) type Replies = Vec<(Box<PendingCommand>, Range<usize>)>;
 
 /// Runs until `shutdown`.
 pub async fn run(
@@ -423,7 +423,7 @@ impl Loop {
             match request {
                 Request::Look(look) => self.looks.push(look),
                 Request::Do(asked) => {
-                    let Asked { command, seen, validate_only, by, request_id, .. } = &*asked;
+                    let PendingCommand { command, seen, validate_only, by, request_id, .. } = &*asked;
                     let permitted = objects::permit(&self.view, &self.board, by, command);
                     let repeat = permitted.and_then(|()| match request_id {
                         Some(id) => idempotency::is_repeat(&self.view.command_keys, id, command, *seen),

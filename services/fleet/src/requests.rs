@@ -56,13 +56,13 @@ pub(crate) type Look = Box<dyn FnOnce(&FleetProjection, &Board, &Now) + Send>;
 /// Something a person asks of the reconciler.
 pub(crate) enum Request {
     /// Change something; answered after the commit.
-    Do(Box<Asked>),
+    Do(Box<PendingCommand>),
     /// Look at something.
     Look(Look),
 }
 
 /// A command, until it is answered.
-pub(crate) struct Asked {
+pub(crate) struct PendingCommand {
     pub command: Command,
     pub seen: Option<Revision>,
     pub validate_only: bool,

@@ -4,7 +4,7 @@
 //! and decided anew if something has; the process that leads obeys what is written.
 
 use crate::reconcile::Loop;
-use crate::{Asked, Request};
+use crate::{PendingCommand, Request};
 use midshift_core::fleet::commands;
 use midshift_core::fleet::{LOGS, Tx, follow_rows, objects, reread};
 use midshift_core::idempotency;
@@ -66,7 +66,7 @@ impl Loop {
     }
 
     /// The answer to whoever asked. An error: what came of it may not be in the projection.
-    async fn carry_out(&mut self, asked: &Asked) -> Result<Result<(), Refusal>, Error> {
+    async fn carry_out(&mut self, asked: &PendingCommand) -> Result<Result<(), Refusal>, Error> {
         let used: Vec<Key> = asked.request_id.iter().map(|id| Key::new(Table::CommandKey, id)).collect();
         for _ in 0..limits::COMMAND_TRIES {
             self.ask(used.clone()).await?;
@@ -96,15 +96,15 @@ impl Loop {
     }
 
     /// What a refusal leaves in the audit.
-    fn refused(&self, asked: &Asked, refusal: &Refusal) -> Vec<Item> {
-        let Asked { command, validate_only, by, request_id, .. } = asked;
+    fn refused(&self, asked: &PendingCommand, refusal: &Refusal) -> Vec<Item> {
+        let PendingCommand { command, validate_only, by, request_id, .. } = asked;
         let item = commands::refusal(&self.view, command, by, request_id.as_deref(), refusal);
         item.into_iter().filter(|_| !validate_only).collect()
     }
 
     /// What has to be written; none: nothing has.
-    fn decide(&mut self, asked: &Asked) -> Result<Option<Item>, Refusal> {
-        let Asked { command, seen, validate_only, by, request_id, .. } = asked;
+    fn decide(&mut self, asked: &PendingCommand) -> Result<Option<Item>, Refusal> {
+        let PendingCommand { command, seen, validate_only, by, request_id, .. } = asked;
         objects::permit(&self.view, &self.board, by, command)?;
         if let Some(id) = request_id
             && idempotency::is_repeat(&self.view.command_keys, id, command, *seen)?

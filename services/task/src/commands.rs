@@ -26,8 +26,8 @@ use std::time::Duration;
 /// Entries about one request_id read at a time; there are one or two.
 const ENTRIES: usize = 16;
 
-/// A request to be made durable.
-pub(crate) struct Asked {
+/// A command for a task, before its request is durable.
+pub(crate) struct PendingCommand {
     pub(crate) ask: Ask,
     pub(crate) reason: String,
     pub(crate) request_id: Option<RequestId>,
@@ -37,7 +37,7 @@ pub(crate) struct Asked {
     pub(crate) robot_id: Option<RobotId>,
 }
 
-impl Asked {
+impl PendingCommand {
     /// What it leaves in the audit.
     fn note(&self) -> Note {
         let note = self.ask.note().because(&self.reason);
@@ -111,7 +111,7 @@ impl TaskService {
         };
         let fits = if earlier.is_none() { fits() } else { Ok(()) };
         let (ask, robot_id) = (Ask::Cancel { task_id: task_id.clone(), force: r.force }, task.state.robot_id.clone());
-        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.into(), robot_id };
+        let asked = PendingCommand { ask, reason: r.reason, request_id, hash, actor: by.into(), robot_id };
         if r.validate_only {
             return fits.map(|()| v1::CancelTaskResponse { task: Some(task.encode()), pending: false });
         }
@@ -160,7 +160,7 @@ impl TaskService {
         };
         let fits = if earlier.is_none() { fits() } else { Ok(()) };
         let (ask, robot_id) = (Ask::Resolve { task_id: task_id.clone(), resolution }, task.state.robot_id.clone());
-        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.into(), robot_id };
+        let asked = PendingCommand { ask, reason: r.reason, request_id, hash, actor: by.into(), robot_id };
         if r.validate_only {
             return fits.map(|()| v1::ResolveTaskResponse { task: Some(task.encode()), pending: false });
         }
@@ -210,7 +210,7 @@ impl TaskService {
     }
 
     /// Makes a request durable unless it is a repeat, and waits a little for fleet. True: fleet has not looked at it yet.
-    pub(crate) async fn ask(&self, earlier: Option<Seq>, asked: Asked) -> Result<bool, Refusal> {
+    pub(crate) async fn ask(&self, earlier: Option<Seq>, asked: PendingCommand) -> Result<bool, Refusal> {
         let place = match earlier {
             Some(place) => place,
             None => self.write(asked).await?,
@@ -230,13 +230,13 @@ impl TaskService {
         if refusal.kind() != Kind::Denied {
             return refusal;
         }
-        let asked = Asked { ask, reason, request_id, hash: String::new(), actor: by.into(), robot_id: None };
+        let asked = PendingCommand { ask, reason, request_id, hash: String::new(), actor: by.into(), robot_id: None };
         let noted = self.noted(&asked, Err(refusal)).await;
         noted.err().unwrap_or_else(internal)
     }
 
     /// Leaves a refusal in the audit. Whoever asked hears why, whether or not that can be written down.
-    pub(crate) async fn noted(&self, asked: &Asked, fits: Result<(), Refusal>) -> Result<(), Refusal> {
+    pub(crate) async fn noted(&self, asked: &PendingCommand, fits: Result<(), Refusal>) -> Result<(), Refusal> {
         if let Err(refusal) = &fits {
             let request_id = asked.request_id.as_ref().map(RequestId::as_str);
             let item = audit::refusal(Writer::Task, &asked.actor, request_id, asked.note(), refusal);
@@ -246,7 +246,7 @@ impl TaskService {
     }
 
     /// The item of a request. The key goes first, so that the number of the item is that of the request itself.
-    pub(crate) fn item_of(&self, asked: &Asked) -> Item {
+    pub(crate) fn item_of(&self, asked: &PendingCommand) -> Item {
         let now = self.inner.parts.clock.now();
         let mut item = Item::new(Writer::Task, &asked.actor);
         item.request_id = asked.request_id.as_ref().map(|r| r.as_str().into());
@@ -266,7 +266,7 @@ impl TaskService {
         item
     }
 
-    async fn write(&self, asked: Asked) -> Result<Seq, Refusal> {
+    async fn write(&self, asked: PendingCommand) -> Result<Seq, Refusal> {
         match self.commit(vec![self.item_of(&asked)]).await.pop().ok_or_else(no_result)? {
             Ok(applied) => Ok(applied.seq),
             // The same call came in twice at once, or the id was used in between.

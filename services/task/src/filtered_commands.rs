@@ -3,7 +3,7 @@
 //! Invariant: a task is asked for at most once a call, and what is counted as asked is durable.
 
 use crate::TaskService;
-use crate::commands::{Asked, hash, reason_text, request_id};
+use crate::commands::{PendingCommand, hash, reason_text, request_id};
 use crate::rows::{TaskRows, read_many, sees, unavailable};
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{RequestId, TaskId};
@@ -208,7 +208,7 @@ impl TaskService {
             count.matched += 1;
             let refusal = self.acts_on(task, by, bulk.permission).and_then(|()| bulk.wish.fits(task)).err();
             let own_id = bulk.request_id.as_ref().map(|id| format!("{id}/{}", task.state.task_id));
-            let asked = Asked {
+            let asked = PendingCommand {
                 ask: bulk.wish.to_ask(task),
                 reason: bulk.reason.clone(),
                 request_id: own_id.and_then(|id| RequestId::parse(&id).ok()),

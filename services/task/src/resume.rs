@@ -4,7 +4,7 @@
 //! after the stop service has answered it, so it is waited for a little.
 
 use crate::TaskService;
-use crate::commands::{Asked, hash, internal, reason_text, request_id};
+use crate::commands::{PendingCommand, hash, internal, reason_text, request_id};
 use crate::rows::{unavailable, unknown_robot};
 use midshift_core::fleet::rows::HoldToken;
 use midshift_core::fleet::stops::Hold;
@@ -100,7 +100,7 @@ impl TaskService {
             }
         }
         let named = Named::from_ask(&ask).filter(|_| earlier.is_none());
-        let asked = Asked { ask, reason: r.reason, request_id, hash, actor: by.into(), robot_id: None };
+        let asked = PendingCommand { ask, reason: r.reason, request_id, hash, actor: by.into(), robot_id: None };
         let held = match &named {
             None => None,
             Some(named) => match self.until_over(named).await {

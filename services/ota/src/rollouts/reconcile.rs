@@ -7,7 +7,7 @@
 
 use super::directives::Signer;
 use super::releases;
-use super::requests::{Asked, Question, Request};
+use super::requests::{PendingCommand, Question, Request};
 use crate::collect::Named;
 use crate::service::OtaService;
 use midshift_core::Boxed;
@@ -85,7 +85,7 @@ pub(super) struct Loop {
 }
 
 /// Commands, what is answered, and the items of a plan that must be committed before.
-type Replies = Vec<(Box<Asked>, Taken, Range<usize>)>;
+type Replies = Vec<(Box<PendingCommand>, Taken, Range<usize>)>;
 
 impl Planner {
     /// Runs until `shutdown`. On a server without keys it only waits: nothing can be signed.
@@ -413,7 +413,12 @@ impl Loop {
     }
 
     /// Answers a command of which these items were committed, or decides it anew.
-    fn settle(&mut self, mut asked: Box<Asked>, taken: Taken, results: Option<&[Result<Applied, CommitError>]>) {
+    fn settle(
+        &mut self,
+        mut asked: Box<PendingCommand>,
+        taken: Taken,
+        results: Option<&[Result<Applied, CommitError>]>,
+    ) {
         asked.lost += 1;
         let answer = match results.map(leadership::settled) {
             Some(Settled::Done) => Ok(taken),

@@ -21,13 +21,13 @@ pub struct Question {
 /// Something a person asks of the planner.
 pub enum Request {
     /// Change something; answered after the commit.
-    Do(Box<Asked>),
+    Do(Box<PendingCommand>),
     /// Read something.
     Question(Question),
 }
 
 /// A command, until it is answered.
-pub struct Asked {
+pub struct PendingCommand {
     pub ask: Ask,
     pub reply: oneshot::Sender<Result<Taken, Refusal>>,
     /// How often it was decided and lost, because what it is about had been changed meanwhile.

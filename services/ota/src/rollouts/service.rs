@@ -1,7 +1,7 @@
 //! What callers have of roll-outs: it hands what they ask to the planner, and waits for the answer.
 
 use super::reconcile::{Parts, Planner};
-use super::requests::{Asked, Question, Request};
+use super::requests::{PendingCommand, Question, Request};
 use crate::service::OtaService;
 use midshift_core::identity::Caller;
 use midshift_core::ids::RolloutId;
@@ -109,7 +109,7 @@ impl RolloutService {
     ) -> Result<Taken, Refusal> {
         let (reply, answer) = oneshot::channel();
         let ask = Ask { command, seen, check_only, request_id, by: by.clone() };
-        self.send(Request::Do(Box::new(Asked { ask, reply, lost: 0 }))).await?;
+        self.send(Request::Do(Box::new(PendingCommand { ask, reply, lost: 0 }))).await?;
         answer.await.map_err(|_| Refusal::new(Kind::Unavailable, Code::CommitUnknown))?
     }
 }
