@@ -22,7 +22,7 @@ const FILE: &str = "authority.pem";
 /// The certificate alone, for whoever wants to hold the server against it.
 pub const PUBLIC_FILE: &str = "ca.pem";
 
-/// Who signs.
+/// The certificate authority of a site, with its private key.
 pub struct Authority {
     issuer: Issuer<'static, KeyPair>,
     certificate_pem: String,
@@ -30,9 +30,9 @@ pub struct Authority {
     site_id: SiteId,
 }
 
-/// A certificate that was signed.
+/// A certificate that the authority signed.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Signed {
+pub struct SignedCertificate {
     /// PEM, the leaf first.
     pub chain_pem: String,
     /// When it is over.
@@ -40,8 +40,8 @@ pub struct Signed {
 }
 
 /// A signing request whose signature holds.
-pub struct Asked {
-    request: CertificateSigningRequestParams,
+pub struct SigningRequest {
+    parameters: CertificateSigningRequestParams,
     /// Digest of its public key.
     pub key: Digest,
 }
@@ -50,15 +50,15 @@ pub struct Asked {
 ///
 /// # Errors
 /// It is none, or is not signed by the key in it.
-pub fn asked(request_pem: &str) -> Result<Asked, Refusal> {
+pub fn read_signing_request(request_pem: &str) -> Result<SigningRequest, Refusal> {
     let bad = |text: String| Refusal::field("request_pem", text);
     if request_pem.len() > limits::SIGNING_REQUEST_BYTES {
         return Err(bad(format!("must be at most {} bytes", limits::SIGNING_REQUEST_BYTES)));
     }
-    let request = CertificateSigningRequestParams::from_pem(request_pem)
+    let parameters = CertificateSigningRequestParams::from_pem(request_pem)
         .map_err(|error| bad(format!("must be a PKCS #10 request in PEM, signed by its own key: {error}")))?;
-    let key = digest(&request.public_key);
-    Ok(Asked { request, key })
+    let key = digest(&parameters.public_key);
+    Ok(SigningRequest { parameters, key })
 }
 
 impl Authority {
@@ -104,29 +104,34 @@ impl Authority {
     ///
     /// # Errors
     /// The signature cannot be made.
-    pub fn sign_robot(&self, asked: Asked, robot_id: &RobotId, now: Utc) -> Result<Signed, Error> {
+    pub fn sign_robot(
+        &self,
+        request: SigningRequest,
+        robot_id: &RobotId,
+        now: Utc,
+    ) -> Result<SignedCertificate, Error> {
         let uri = format!("spiffe://{}/robot/{robot_id}", self.site_id);
         let mut params = leaf(robot_id.as_str(), ExtendedKeyUsagePurpose::ClientAuth);
         params.subject_alt_names = vec![SanType::URI(uri.try_into().map_err(Error::Signing)?)];
         let expires = last(&mut params, now, limits::ROBOT_CERTIFICATE_VALID);
-        Ok(Signed { chain_pem: self.sign(asked, params)?.pem(), expires })
+        Ok(SignedCertificate { chain_pem: self.sign(request, params)?.pem(), expires })
     }
 
     /// For a server process under these names and addresses. The root stands behind it, so that a machine that knows its digest alone can check it.
     ///
     /// # Errors
     /// A name is none, or the signature cannot be made.
-    pub fn sign_server(&self, asked: Asked, names: &[String], now: Utc) -> Result<Signed, Error> {
+    pub fn sign_server(&self, request: SigningRequest, names: &[String], now: Utc) -> Result<SignedCertificate, Error> {
         let mut params = leaf("midshift", ExtendedKeyUsagePurpose::ServerAuth);
         params.subject_alt_names = CertificateParams::new(names).map_err(Error::Signing)?.subject_alt_names;
         let expires = last(&mut params, now, limits::SERVER_CERTIFICATE_VALID);
-        let leaf = self.sign(asked, params)?;
-        Ok(Signed { chain_pem: format!("{}{}", leaf.pem(), self.certificate_pem), expires })
+        let leaf = self.sign(request, params)?;
+        Ok(SignedCertificate { chain_pem: format!("{}{}", leaf.pem(), self.certificate_pem), expires })
     }
 
-    fn sign(&self, mut asked: Asked, params: CertificateParams) -> Result<Certificate, Error> {
-        asked.request.params = params;
-        asked.request.signed_by(&self.issuer).map_err(Error::Signing)
+    fn sign(&self, mut request: SigningRequest, params: CertificateParams) -> Result<Certificate, Error> {
+        request.parameters.params = params;
+        request.parameters.signed_by(&self.issuer).map_err(Error::Signing)
     }
 }
 

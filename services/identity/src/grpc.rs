@@ -1,6 +1,6 @@
 //! The two faces: decode, decide, encode.
 
-use crate::authority::{Authority, Signed, asked};
+use crate::authority::{Authority, SignedCertificate, read_signing_request};
 use crate::register::decided;
 use crate::tokens::rotate::{self, Turn};
 use crate::tokens::{self, Wanted};
@@ -176,8 +176,8 @@ impl IdentityService {
         let (Some(robot_id), Some(secret)) = (robot_id, secret) else {
             return Err(Refusal::field("secret", "is required"));
         };
-        let ((authority, now), asked) = (self.signing()?, asked(&r.request_pem)?);
-        let (key, digest) = (asked.key, tokens::digest(&secret));
+        let ((authority, now), request) = (self.signing()?, read_signing_request(&r.request_pem)?);
+        let (key, digest) = (request.key, tokens::digest(&secret));
         let expires = Utc(now.0.saturating_add_unsigned(limits::ROBOT_CERTIFICATE_VALID.as_ms()));
         // One at a time: whether a key is another robot's is decided over all of them.
         let _alone = self.0.enrolling.lock().await;
@@ -206,7 +206,8 @@ impl IdentityService {
             .map_err(|refusal| about(refusal, &robot_id))?;
         // The key of the machine whose place it took.
         self.recorded().await?;
-        let Signed { chain_pem, expires } = authority.sign_robot(asked, &robot_id, now).map_err(|e| hidden(&e))?;
+        let SignedCertificate { chain_pem, expires } =
+            authority.sign_robot(request, &robot_id, now).map_err(|e| hidden(&e))?;
         tracing::info!(%robot_id, %key, "a robot was enrolled");
         Ok(v1::EnrolResponse {
             certificate_pem: chain_pem,
@@ -223,8 +224,8 @@ impl IdentityService {
     ) -> Result<v1::RenewCertificateResponse, Refusal> {
         let robot_id = robot_of(&r.robot_id)?;
         caller.is_robot(&robot_id)?;
-        let ((authority, now), asked) = (self.signing()?, asked(&r.request_pem)?);
-        let key = asked.key;
+        let ((authority, now), request) = (self.signing()?, read_signing_request(&r.request_pem)?);
+        let key = request.key;
         let expires = Utc(now.0.saturating_add_unsigned(limits::ROBOT_CERTIFICATE_VALID.as_ms()));
         self.0
             .register
@@ -236,7 +237,8 @@ impl IdentityService {
             })
             .await
             .map_err(|refusal| about(refusal, &robot_id))?;
-        let Signed { chain_pem, expires } = authority.sign_robot(asked, &robot_id, now).map_err(|e| hidden(&e))?;
+        let SignedCertificate { chain_pem, expires } =
+            authority.sign_robot(request, &robot_id, now).map_err(|e| hidden(&e))?;
         Ok(v1::RenewCertificateResponse {
             certificate_pem: chain_pem,
             authority_pem: authority.certificate_pem().to_owned(),

@@ -27,7 +27,7 @@ pub use proof::write_proof;
 pub use retention::prune;
 pub use revocation_list::RevocationList;
 
-use authority::{Authority, asked};
+use authority::{Authority, read_signing_request};
 use error::ANSWERED_WITHIN;
 use midshift_core::Boxed;
 use midshift_core::audit::Note;
@@ -266,8 +266,8 @@ async fn answer(authority: &Authority, register: &Register, now: Utc) -> Result<
     let waiting =
         register.ask(|view| view.servers.values().map(|(row, _)| row).filter(open).cloned().collect::<Vec<_>>());
     for row in waiting.await.map_err(Error::Store)? {
-        let signed = match asked(&row.request_pem) {
-            Ok(asked) => authority.sign_server(asked, &row.names, now),
+        let signed = match read_signing_request(&row.request_pem) {
+            Ok(request) => authority.sign_server(request, &row.names, now),
             Err(refusal) => Err(refusal.into()),
         };
         let signed = match signed {

@@ -3,7 +3,7 @@
 //! Invariant: the key never leaves its file. A process that shares the store with others is one of the site's servers: who may write there may ask for a
 //! certificate, so the store is as private as the authority (docs/security.md).
 
-use crate::authority::asked;
+use crate::authority::read_signing_request;
 use crate::register::{Register, written};
 use crate::{Error, files};
 use midshift_core::identity::{Digest, ServerCertificate, ServerProof};
@@ -55,7 +55,7 @@ impl OwnKey {
         };
         let params = CertificateParams::new(names.as_slice()).map_err(|source| Error::Names { source })?;
         let request_pem = params.serialize_request(&key).and_then(|r| r.pem()).map_err(Error::Signing)?;
-        let digest = asked(&request_pem).map_err(Error::Refused)?.key;
+        let digest = read_signing_request(&request_pem).map_err(Error::Refused)?.key;
         Ok(Self { key, names, digest, request_pem })
     }
 
