@@ -17,7 +17,7 @@ use crate::repository::{
     self, FileTarget, PEOPLE_LIFE_MS, Profile, RootDraft, Signers, add_signatures, check_root, check_targets, listed,
     sign_root, sign_targets, version_of,
 };
-use crate::roots::{Asked, merge_targets};
+use crate::roots::{RequiredSigners, merge_targets};
 use crate::ways::ways_to;
 use midshift_core::reason::{Refusal, Violations};
 use midshift_core::time::Utc;
@@ -350,7 +350,7 @@ impl Folder {
             let text = "a document waits for signatures: sign that first, or remove metadata/pending.targets.json";
             return Err(Refusal::field("repository", text).into());
         }
-        Ok(Asked::for_targets(&self.root()?.1)?.must_name(keys)?)
+        Ok(RequiredSigners::for_targets(&self.root()?.1)?.must_name(keys)?)
     }
 
     /// Adds signatures to the document that waits for them: by `keys`, and those that others handed over. Where none waits yet, the first
@@ -359,8 +359,8 @@ impl Folder {
     /// # Errors
     /// If none waits; a key that is not asked for; what was handed over and is no signature of this document. Nothing is added then.
     pub fn cosign(&self, keys: &[&SecretKey], handed: &[Vec<u8>]) -> Result<Signed, Error> {
-        let asked = Asked::for_targets(&self.root()?.1)?;
-        asked.must_name(keys)?;
+        let required = RequiredSigners::for_targets(&self.root()?.1)?;
+        required.must_name(keys)?;
         let mut document = match (self.document(PENDING)?, handed.first()) {
             (Some(waiting), _) => waiting,
             (None, Some(handed)) => {
@@ -371,7 +371,7 @@ impl Folder {
             (None, None) => return Err(Refusal::field("pending", "no targets document waits for signatures").into()),
         };
         for handed in handed {
-            document = merge_targets(&document, handed, &asked)?;
+            document = merge_targets(&document, handed, &required)?;
         }
         self.store_signed(&add_signatures(&document, keys)?)
     }

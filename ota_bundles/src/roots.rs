@@ -169,11 +169,11 @@ fn signers(root: &Root, role: Role) -> Signers {
     Signers { keys: keys.collect(), threshold: named.threshold.get() }
 }
 
-/// Who must sign a document: enough of each group.
+/// The keys that must sign a document: enough of each group.
 #[derive(Clone, Debug)]
-pub struct Asked(Vec<Signers>);
+pub struct RequiredSigners(Vec<Signers>);
 
-impl Asked {
+impl RequiredSigners {
     /// For a targets document.
     ///
     /// # Errors
@@ -199,8 +199,8 @@ impl Asked {
     /// # Errors
     /// The first that is not.
     pub fn must_name(&self, keys: &[&SecretKey]) -> Result<(), Refusal> {
-        let foreign = keys.iter().map(|key| key.public()).find(|key| !self.keys().any(|asked| asked == key));
-        foreign.map_or(Ok(()), |key| Err(not_asked(key.id())))
+        let foreign = keys.iter().map(|key| key.public()).find(|key| !self.keys().any(|required| required == key));
+        foreign.map_or(Ok(()), |key| Err(not_required(key.id())))
     }
 
     /// Keys that signed a root, and how many signatures each group still lacks.
@@ -223,7 +223,7 @@ impl Asked {
     }
 }
 
-fn not_asked(id: impl fmt::Display) -> Refusal {
+fn not_required(id: impl fmt::Display) -> Refusal {
     Refusal::field("signature", format!("key {id} is not asked for: the document gains nothing by it"))
 }
 
@@ -231,16 +231,16 @@ fn not_asked(id: impl fmt::Display) -> Refusal {
 ///
 /// # Errors
 /// A file that is neither; another document; a signature by a key that is not asked for, or one that does not hold.
-pub fn merge_root(document: &[u8], handed: &[u8], asked: &Asked) -> Result<Vec<u8>, Refusal> {
-    merge::<Root>("root", document, handed, asked)
+pub fn merge_root(document: &[u8], handed: &[u8], required: &RequiredSigners) -> Result<Vec<u8>, Refusal> {
+    merge::<Root>("root", document, handed, required)
 }
 
 /// As [`merge_root`], for targets.
 ///
 /// # Errors
 /// As there.
-pub fn merge_targets(document: &[u8], handed: &[u8], asked: &Asked) -> Result<Vec<u8>, Refusal> {
-    merge::<Targets>("targets", document, handed, asked)
+pub fn merge_targets(document: &[u8], handed: &[u8], required: &RequiredSigners) -> Result<Vec<u8>, Refusal> {
+    merge::<Targets>("targets", document, handed, required)
 }
 
 /// The bytes that are signed, for tools that sign plain bytes.
@@ -251,7 +251,7 @@ pub fn message(root: &[u8]) -> Result<Vec<u8>, Error> {
     Ok(canonical(&read::<Root>("root", root)?.signed))
 }
 
-fn merge<T>(role: &'static str, document: &[u8], handed: &[u8], asked: &Asked) -> Result<Vec<u8>, Refusal>
+fn merge<T>(role: &'static str, document: &[u8], handed: &[u8], required: &RequiredSigners) -> Result<Vec<u8>, Refusal>
 where
     T: tough::schema::Role + Serialize + DeserializeOwned,
 {
@@ -267,7 +267,7 @@ where
         ours.signatures.push(page);
     };
     if handed.len() == BARE_SIGNATURE_BYTES {
-        let key = asked.keys().find(|key| key.verifies(&message, handed));
+        let key = required.keys().find(|key| key.verifies(&message, handed));
         add(key.ok_or_else(|| refused("is of no key that is asked for".to_owned()))?, handed);
     } else {
         let theirs: Signed<T> = read(role, handed).map_err(unread)?;
@@ -276,7 +276,9 @@ where
         }
         for signature in &theirs.signatures {
             let id = hex(&signature.keyid);
-            let Some(key) = asked.keys().find(|key| key.id().to_string() == id) else { return Err(not_asked(id)) };
+            let Some(key) = required.keys().find(|key| key.id().to_string() == id) else {
+                return Err(not_required(id));
+            };
             if !key.verifies(&message, &signature.sig) {
                 return Err(refused(format!("that of key {id} does not hold")));
             }

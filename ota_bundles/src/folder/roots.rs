@@ -6,7 +6,7 @@
 use super::{Error, Folder, Signed, io, must_be_next};
 use crate::keys::SecretKey;
 use crate::repository::{PEOPLE_LIFE_MS, RootDraft, add_signatures, check_root, sign_root};
-use crate::roots::{Asked, Change, WaitingRoot, merge_root};
+use crate::roots::{Change, RequiredSigners, WaitingRoot, merge_root};
 use midshift_core::reason::Refusal;
 use midshift_core::time::Utc;
 
@@ -40,7 +40,7 @@ impl Folder {
         let (newest, root) = self.root()?;
         let draft = RootDraft::from_root(&document)?;
         must_be_next("root", draft.version, newest + 1)?;
-        let (signed_by, lacks) = Asked::for_root(&root, &document)?.standing(&document)?;
+        let (signed_by, lacks) = RequiredSigners::for_root(&root, &document)?.standing(&document)?;
         let lack = |group: usize| lacks.get(group).copied().unwrap_or_default();
         let (lacks_of_before, lacks_of_own) = (lack(0), lack(1));
         Ok(Some(WaitingRoot { document, draft, signed_by, lacks_of_before, lacks_of_own }))
@@ -60,10 +60,10 @@ impl Folder {
         };
         let version = RootDraft::from_root(&document)?.version;
         must_be_next("root", version, newest + 1)?;
-        let asked = Asked::for_root(&before, &document)?;
-        asked.must_name(keys)?;
+        let required = RequiredSigners::for_root(&before, &document)?;
+        required.must_name(keys)?;
         for handed in handed {
-            document = merge_root(&document, handed, &asked)?;
+            document = merge_root(&document, handed, &required)?;
         }
         document = add_signatures(&document, keys)?;
         if check_root(&before, &document).is_err() {
