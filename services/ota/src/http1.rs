@@ -84,11 +84,11 @@ async fn send(downloads: &Downloads, name: &str, headers: &HeaderMap) -> Result<
     let text = |name| headers.get(name).and_then(|value| value.to_str().ok());
     // A client that has the beginning of another file gets this one whole.
     let same = text(IF_RANGE).is_none_or(|seen| seen == etag);
-    let asked = text(RANGE).filter(|_| same).map_or(Asked::Whole, |range| asked(range, file.length));
-    let (code, range) = match asked {
-        Asked::Whole => (StatusCode::OK, 0..file.length),
-        Asked::Part(range) => (StatusCode::PARTIAL_CONTENT, range),
-        Asked::Beyond => {
+    let requested = text(RANGE).filter(|_| same).map_or(RequestedRange::Whole, |range| parse_range(range, file.length));
+    let (code, range) = match requested {
+        RequestedRange::Whole => (StatusCode::OK, 0..file.length),
+        RequestedRange::Part(range) => (StatusCode::PARTIAL_CONTENT, range),
+        RequestedRange::Beyond => {
             let length = [(CONTENT_RANGE, format!("bytes */{}", file.length))];
             return Ok(Some((StatusCode::RANGE_NOT_SATISFIABLE, length).into_response()));
         }
@@ -108,32 +108,32 @@ async fn send(downloads: &Downloads, name: &str, headers: &HeaderMap) -> Result<
     Ok(response.body(body).ok())
 }
 
-/// What a client asks for.
+/// The range of a file that a client requests.
 #[derive(Clone, Debug, PartialEq, Eq)]
-enum Asked {
+enum RequestedRange {
     Whole,
     Part(Range<u64>),
     /// Nothing of it is there.
     Beyond,
 }
 
-/// Reads a `Range` header. What is not understood, and more than one range, is answered with the whole, as RFC 9110 allows.
-fn asked(header: &str, length: u64) -> Asked {
+/// Parses a `Range` header. What is not understood, and more than one range, is answered with the whole, as RFC 9110 allows.
+fn parse_range(header: &str, length: u64) -> RequestedRange {
     let bounds = header.strip_prefix("bytes=").and_then(|set| set.trim().split_once('-'));
-    let Some((first, last)) = bounds else { return Asked::Whole };
+    let Some((first, last)) = bounds else { return RequestedRange::Whole };
     let digits = |text: &str| text.bytes().all(|b| b.is_ascii_digit());
     if !digits(first) || !digits(last) || (first.is_empty() && last.is_empty()) {
-        return Asked::Whole;
+        return RequestedRange::Whole;
     }
     // More digits than any file has bytes: beyond it.
     let number = |text: &str| text.parse::<u64>().unwrap_or(u64::MAX);
     let range = match (first, last) {
         ("", suffix) => length.saturating_sub(number(suffix))..length,
         (first, "") => number(first)..length,
-        (first, last) if number(last) < number(first) => return Asked::Whole,
+        (first, last) if number(last) < number(first) => return RequestedRange::Whole,
         (first, last) => number(first)..number(last).saturating_add(1).min(length),
     };
-    if range.start >= range.end { Asked::Beyond } else { Asked::Part(range) }
+    if range.start >= range.end { RequestedRange::Beyond } else { RequestedRange::Part(range) }
 }
 
 #[cfg(test)]

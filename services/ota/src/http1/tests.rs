@@ -1,6 +1,6 @@
 //! Pages as plain HTTP clients ask for them.
 
-use super::{Asked, asked};
+use super::{RequestedRange, parse_range};
 use crate::OtaService;
 use crate::fixture::{files, release, service};
 use axum::body::{Body, to_bytes};
@@ -117,22 +117,22 @@ async fn a_server_without_keys_says_so() {
 fn ranges_are_read_as_the_standard_says() {
     let large = 1 << 33;
     for (header, length, expected) in [
-        ("bytes=0-0", 10, Asked::Part(0..1)),
-        ("bytes=9-9", 10, Asked::Part(9..10)),
-        ("bytes=10-", 10, Asked::Beyond),
-        ("bytes=-0", 10, Asked::Beyond),
-        ("bytes=0-", 0, Asked::Beyond),
-        ("bytes=4294967296-4294967297", large, Asked::Part((1 << 32)..(1 << 32) + 2)),
-        ("bytes=99999999999999999999999-", 10, Asked::Beyond),
-        ("bytes=0-99999999999999999999999", 10, Asked::Part(0..10)),
-        ("bytes=5-4", 10, Asked::Whole),
-        ("bytes=-", 10, Asked::Whole),
-        ("bytes=0-1,3-4", 10, Asked::Whole),
-        ("bytes=+1-2", 10, Asked::Whole),
-        ("bytes=1--2", 10, Asked::Whole),
-        ("lines=1-2", 10, Asked::Whole),
-        ("", 10, Asked::Whole),
+        ("bytes=0-0", 10, RequestedRange::Part(0..1)),
+        ("bytes=9-9", 10, RequestedRange::Part(9..10)),
+        ("bytes=10-", 10, RequestedRange::Beyond),
+        ("bytes=-0", 10, RequestedRange::Beyond),
+        ("bytes=0-", 0, RequestedRange::Beyond),
+        ("bytes=4294967296-4294967297", large, RequestedRange::Part((1 << 32)..(1 << 32) + 2)),
+        ("bytes=99999999999999999999999-", 10, RequestedRange::Beyond),
+        ("bytes=0-99999999999999999999999", 10, RequestedRange::Part(0..10)),
+        ("bytes=5-4", 10, RequestedRange::Whole),
+        ("bytes=-", 10, RequestedRange::Whole),
+        ("bytes=0-1,3-4", 10, RequestedRange::Whole),
+        ("bytes=+1-2", 10, RequestedRange::Whole),
+        ("bytes=1--2", 10, RequestedRange::Whole),
+        ("lines=1-2", 10, RequestedRange::Whole),
+        ("", 10, RequestedRange::Whole),
     ] {
-        assert_eq!(asked(header, length), expected, "{header} of {length}");
+        assert_eq!(parse_range(header, length), expected, "{header} of {length}");
     }
 }
