@@ -20,14 +20,15 @@ pub struct Tasks {
     run: String,
     /// Number of the newest task when the run began.
     before: u64,
-    asked: BTreeMap<TaskId, Asked>,
+    admitted: BTreeMap<TaskId, Admission>,
     states: BTreeMap<TaskId, (Phase, Option<Utc>)>,
     /// Tasks of the run with both their rows.
     own: BTreeSet<TaskId>,
 }
 
+/// When a task was admitted, and whether the run's own client asked for it.
 #[derive(Debug)]
-struct Asked {
+struct Admission {
     created: Utc,
     is_own: bool,
 }
@@ -71,7 +72,7 @@ impl Tasks {
     pub fn completions_s(&self) -> Vec<f64> {
         let took = |id: &TaskId| {
             let ended = self.states.get(id).filter(|(phase, _)| *phase == Phase::Succeeded)?.1?;
-            Some(ended.ms_since(self.asked.get(id)?.created) as f64 / 1000.0)
+            Some(ended.ms_since(self.admitted.get(id)?.created) as f64 / 1000.0)
         };
         let mut took: Vec<f64> = self.own.iter().filter_map(took).collect();
         took.sort_by(f64::total_cmp);
@@ -82,7 +83,7 @@ impl Tasks {
         if row.key.table == Table::TaskIntake {
             let intake = row.decode::<TaskIntake>()?;
             let is_own = !self.run.is_empty() && intake.request_id.starts_with(&self.run);
-            self.asked.insert(intake.task_id.clone(), Asked { created: intake.created, is_own });
+            self.admitted.insert(intake.task_id.clone(), Admission { created: intake.created, is_own });
             self.note_own(&intake.task_id);
         } else {
             let state = row.decode::<TaskState>()?;
@@ -92,7 +93,7 @@ impl Tasks {
         Ok(())
     }
     fn note_own(&mut self, id: &TaskId) {
-        if self.states.contains_key(id) && self.asked.get(id).is_some_and(|a| a.is_own) {
+        if self.states.contains_key(id) && self.admitted.get(id).is_some_and(|a| a.is_own) {
             self.own.insert(id.clone());
         }
     }
