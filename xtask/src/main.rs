@@ -39,7 +39,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Verb {
     /// Run the whole suite, or only the named parts, and print the minutes of each.
-    Test(suite::Asked),
+    Test(suite::TestArgs),
     /// Long fault sweeps, of which CI runs a sample: programs that are killed at work, simulated shifts, power cuts of updates, kills at each write of a latch,
     /// stops in simulated cuts and kills, stories, and nights.
     Torture {

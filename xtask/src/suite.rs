@@ -15,7 +15,7 @@ use std::time::Duration;
 
 /// What of the suite is run.
 #[derive(Args)]
-pub struct Asked {
+pub struct TestArgs {
     /// First install what the tests of real components need (grpcurl, buf, a Python with gRPC, the modules of the clients) into
     /// target/tools, and strace, Go, Node.js and docker into the system; for a nightly run cargo-deny as well.
     #[arg(long)]
@@ -45,23 +45,23 @@ struct Line {
 }
 
 /// Runs what is asked for, or everything if nothing is named; whether all passed.
-pub fn test(workspace: &Workspace, asked: &Asked) -> Result<bool> {
-    let scope = if asked.nightly { Scope::Nightly } else { Scope::Daily };
-    let mut parts = in_order(&asked.parts, scope);
-    if asked.no_docker {
+pub fn test(workspace: &Workspace, args: &TestArgs) -> Result<bool> {
+    let scope = if args.nightly { Scope::Nightly } else { Scope::Daily };
+    let mut parts = in_order(&args.parts, scope);
+    if args.no_docker {
         parts.retain(|part| *part != Part::Compose);
         run::tell_person("--no-docker: the part `compose` is left out");
     }
-    ensure!(asked.only.is_empty() || parts.contains(&Part::E2e), "--only chooses tests of the part `e2e`: name it too");
+    ensure!(args.only.is_empty() || parts.contains(&Part::E2e), "--only chooses tests of the part `e2e`: name it too");
     let (mut lines, mut count) = (Vec::new(), Count::default());
-    let mut round = Round { workspace, tools: None, scope, only: &asked.only };
+    let mut round = Round { workspace, tools: None, scope, only: &args.only };
     if parts.iter().any(|part| part.needs_tools()) {
-        let (found, took) = timed(|| if asked.install { Tools::install(workspace) } else { Tools::find(workspace) });
+        let (found, took) = timed(|| if args.install { Tools::install(workspace) } else { Tools::find(workspace) });
         round.tools = Some(found?);
-        if asked.install && parts.contains(&Part::Compose) {
+        if args.install && parts.contains(&Part::Compose) {
             docker::install(workspace)?;
         }
-        if asked.install && parts.contains(&Part::Deny) {
+        if args.install && parts.contains(&Part::Deny) {
             deny::install(workspace)?;
         }
         lines.push(Line { name: "tools".to_owned(), took, passed: true, again: String::new() });
