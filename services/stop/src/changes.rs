@@ -4,7 +4,7 @@
 //! was written and recorded, or says that it was not.
 
 use crate::audit::{Action, MIDSHIFT, Note};
-use crate::engaged::{Asked, EngagedStops, Resetting};
+use crate::engaged::{EngagedByRequest, EngagedStops, Resetting};
 use crate::frames;
 use crate::inner::Inner;
 use crate::outbox::Frame;
@@ -72,8 +72,9 @@ pub fn engage(inner: &Inner, wanted: Wanted) -> Result<Engaged, Refusal> {
     let mut stop = Stop { actor, reason, region, token_id, ..bare };
     inner.key.mark(&mut stop);
     let request_id = wanted.request.as_ref().map(|(id, _)| id.to_string());
-    let asked = wanted.request.map(|(id, hash)| (id, Asked { stop_id: stop.stop_id.clone(), hash, at: now.wall }));
-    let generation = engaged_stops.engage(stop.clone(), asked);
+    let request =
+        wanted.request.map(|(id, hash)| (id, EngagedByRequest { stop_id: stop.stop_id.clone(), hash, at: now.wall }));
+    let generation = engaged_stops.engage(stop.clone(), request);
     let version = engaged_stops.version();
     let note = note(Action::Engaged, &stop, now.wall);
     inner.disk.note(request_id.iter().fold(note, |note, id| note.with("request_id", id)));
@@ -90,15 +91,16 @@ pub fn engage(inner: &Inner, wanted: Wanted) -> Result<Engaged, Refusal> {
 /// What the same request engaged before.
 fn before(engaged_stops: &EngagedStops, wanted: &Wanted) -> Result<Option<Engaged>, Refusal> {
     let Some((request_id, hash)) = &wanted.request else { return Ok(None) };
-    let Some(asked) = engaged_stops.asked(request_id) else { return Ok(None) };
-    if asked.hash != *hash {
+    let Some(engaged) = engaged_stops.engaged_by(request_id) else { return Ok(None) };
+    if engaged.hash != *hash {
         let text = "this request_id engaged another stop; nothing more was stopped";
-        let reason = Reason::new(Code::RequestIdReused, text).with("stop_id", &asked.stop_id);
+        let reason = Reason::new(Code::RequestIdReused, text).with("stop_id", &engaged.stop_id);
         return Err(Refusal::new(Kind::AlreadyExists, reason));
     }
-    match engaged_stops.latch().stop(&asked.stop_id).filter(|stop| engaged_stops.latch().is_effective(&stop.stop_id)) {
+    match engaged_stops.latch().stop(&engaged.stop_id).filter(|stop| engaged_stops.latch().is_effective(&stop.stop_id))
+    {
         Some(stop) => Ok(Some(Engaged { stop: stop.clone(), version: engaged_stops.version() })),
-        None => Err(was_reset(&asked.stop_id)),
+        None => Err(was_reset(&engaged.stop_id)),
     }
 }
 

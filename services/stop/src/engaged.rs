@@ -16,24 +16,24 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// What survives the end of the service.
+/// The state that survives the end of the service, as its latch file holds it.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Kept {
+pub struct SavedState {
     /// Stops and resets.
     pub latch: Latch,
     /// State of the latch.
     pub generation: u64,
     /// Which request engaged which stop.
     #[serde(default)]
-    pub requests: BTreeMap<RequestId, Asked>,
+    pub requests: BTreeMap<RequestId, EngagedByRequest>,
     /// The last record of the audit.
     #[serde(default)]
     pub audit: Tail,
 }
 
-/// What was engaged by one request.
+/// The stop that one request engaged.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Asked {
+pub struct EngagedByRequest {
     /// The stop.
     pub stop_id: StopId,
     /// SHA-256 of the request, hexadecimal.
@@ -69,18 +69,18 @@ pub struct EngagedStops {
     latch: Latch,
     generation: u64,
     since: BTreeMap<StopId, u64>,
-    requests: BTreeMap<RequestId, Asked>,
+    requests: BTreeMap<RequestId, EngagedByRequest>,
     pending: Vec<Pending>,
     version: u64,
     everything: Option<Arc<[Bytes]>>,
 }
 
 impl EngagedStops {
-    /// With what was kept. Generations go on rising, also if the last of them were not kept.
-    pub fn begin(kept: Kept, now: Utc) -> Self {
-        let generation = now.0.max(0).cast_unsigned().max(kept.generation + 1);
-        let since = kept.latch.effective().map(|stop| (stop.stop_id.clone(), generation)).collect();
-        let (latch, requests) = (kept.latch, kept.requests);
+    /// Begins with the saved state. Generations go on rising, also if the last of them were not saved.
+    pub fn begin(saved: SavedState, now: Utc) -> Self {
+        let generation = now.0.max(0).cast_unsigned().max(saved.generation + 1);
+        let since = saved.latch.effective().map(|stop| (stop.stop_id.clone(), generation)).collect();
+        let (latch, requests) = (saved.latch, saved.requests);
         // The new generation is kept too.
         Self { latch, generation, since, requests, pending: Vec::new(), version: 1, everything: None }
     }
@@ -95,7 +95,7 @@ impl EngagedStops {
         self.generation
     }
 
-    /// Counts what is to be kept.
+    /// Number of the newest state that is to be saved.
     pub fn version(&self) -> u64 {
         self.version
     }
@@ -105,8 +105,8 @@ impl EngagedStops {
         self.latch.effective().map(|stop| (stop, self.since.get(&stop.stop_id).copied().unwrap_or(self.generation)))
     }
 
-    /// What a request engaged before.
-    pub fn asked(&self, request_id: &RequestId) -> Option<&Asked> {
+    /// The stop that a request engaged before; none: it engaged none.
+    pub fn engaged_by(&self, request_id: &RequestId) -> Option<&EngagedByRequest> {
         self.requests.get(request_id)
     }
 
@@ -138,15 +138,15 @@ impl EngagedStops {
     }
 
     /// Adds a stop. The state of the latch with it; none: it was known.
-    pub fn engage(&mut self, stop: Stop, asked: Option<(RequestId, Asked)>) -> Option<u64> {
+    pub fn engage(&mut self, stop: Stop, request: Option<(RequestId, EngagedByRequest)>) -> Option<u64> {
         let stop_id = stop.stop_id.clone();
         if !self.latch.engage(stop) {
             return None;
         }
-        if let Some((request_id, asked)) = asked {
-            self.requests.insert(request_id, asked);
+        if let Some((request_id, engaged)) = request {
+            self.requests.insert(request_id, engaged);
             if self.requests.len() > limits::STOP_REQUESTS_MAX {
-                let oldest = self.requests.iter().min_by_key(|(_, asked)| asked.at).map(|(id, _)| id.clone());
+                let oldest = self.requests.iter().min_by_key(|(_, engaged)| engaged.at).map(|(id, _)| id.clone());
                 oldest.map(|id| self.requests.remove(&id));
             }
         }
@@ -196,18 +196,18 @@ impl EngagedStops {
     pub fn forget(&mut self, now: Utc) {
         if self.latch.forget(now, limits::RESETS_MAX) {
             let latch = &self.latch;
-            self.requests.retain(|_, asked| latch.stop(&asked.stop_id).is_some());
+            self.requests.retain(|_, engaged| latch.stop(&engaged.stop_id).is_some());
             self.version += 1;
         }
     }
 
-    /// What is to be kept, with what waits for it.
-    pub fn kept(&self, audit: Tail) -> Kept {
+    /// The state to save, with the resets that wait for it.
+    pub fn state_to_save(&self, audit: Tail) -> SavedState {
         let mut latch = self.latch.clone();
         for pending in &self.pending {
             latch.reset(pending.reset.clone());
         }
-        Kept { latch, generation: self.generation, requests: self.requests.clone(), audit }
+        SavedState { latch, generation: self.generation, requests: self.requests.clone(), audit }
     }
 
     /// It does not fit the file: the older half of the resets is forgotten.
@@ -264,12 +264,12 @@ mod tests {
 
     #[test]
     fn a_reset_counts_after_the_turn_of_the_disk_and_what_is_kept_has_it_before() {
-        let mut engaged_stops = EngagedStops::begin(Kept::default(), Utc(1_000));
+        let mut engaged_stops = EngagedStops::begin(SavedState::default(), Utc(1_000));
         let id = engaged_stops.draw(Utc(0));
         engaged_stops.engage(stop(id.clone(), Scope::Fleet), None).unwrap();
         let resetting = engaged_stops.reset(reset(&id));
         assert!(resetting.was_engaged && engaged_stops.latch().is_effective(&id), "robots still obey it");
-        assert!(!engaged_stops.kept(Tail::default()).latch.is_effective(&id));
+        assert!(!engaged_stops.state_to_save(Tail::default()).latch.is_effective(&id));
         assert!(engaged_stops.settle(resetting.version - 1, Utc(2)).is_empty());
         assert_eq!(engaged_stops.settle(resetting.version, Utc(2)), [(reset(&id), engaged_stops.generation())]);
         assert!(!engaged_stops.latch().is_effective(&id));
@@ -279,9 +279,9 @@ mod tests {
 
     #[test]
     fn what_was_reset_long_ago_goes_by_itself_and_what_is_kept_is_another_then() {
-        let mut engaged_stops = EngagedStops::begin(Kept::default(), Utc(0));
+        let mut engaged_stops = EngagedStops::begin(SavedState::default(), Utc(0));
         let (old, engaged) = (engaged_stops.draw(Utc(0)), engaged_stops.draw(Utc(0)));
-        let asked = Asked { stop_id: old.clone(), hash: String::new(), at: Utc(1) };
+        let asked = EngagedByRequest { stop_id: old.clone(), hash: String::new(), at: Utc(1) };
         engaged_stops
             .engage(stop(old.clone(), Scope::Fleet), Some((RequestId::parse("once").unwrap(), asked)))
             .unwrap();
@@ -293,21 +293,21 @@ mod tests {
         assert_eq!(engaged_stops.version(), version, "nothing is old yet");
         engaged_stops.forget(Utc(3).plus_ms(age));
         assert_eq!(engaged_stops.version(), version + 1);
-        let kept = engaged_stops.kept(Tail::default());
-        assert!(kept.latch.stop(&old).is_none() && kept.requests.is_empty(), "{kept:?}");
-        assert!(kept.latch.is_effective(&engaged), "what is engaged has no age");
+        let saved = engaged_stops.state_to_save(Tail::default());
+        assert!(saved.latch.stop(&old).is_none() && saved.requests.is_empty(), "{saved:?}");
+        assert!(saved.latch.is_effective(&engaged), "what is engaged has no age");
     }
 
     #[test]
     fn generations_rise_over_restarts_whatever_the_wall_says() {
-        let engaged_stops = EngagedStops::begin(Kept { generation: 5_000, ..Kept::default() }, Utc(1_000));
+        let engaged_stops = EngagedStops::begin(SavedState { generation: 5_000, ..SavedState::default() }, Utc(1_000));
         assert_eq!(engaged_stops.generation(), 5_001);
-        assert_eq!(EngagedStops::begin(Kept::default(), Utc(1_000)).generation(), 1_000);
+        assert_eq!(EngagedStops::begin(SavedState::default(), Utc(1_000)).generation(), 1_000);
     }
 
     #[test]
     fn the_last_stops_are_kept_for_the_fleet_and_the_refusal_says_so() {
-        let mut engaged_stops = EngagedStops::begin(Kept::default(), Utc(0));
+        let mut engaged_stops = EngagedStops::begin(SavedState::default(), Utc(0));
         let robot = Scope::Robot(RobotId::parse("r1").unwrap());
         let halt = StopLevel::Halt;
         for _ in 0..limits::STOPS_MAX - limits::STOPS_FOR_FLEET {
@@ -329,7 +329,7 @@ mod tests {
 
     #[test]
     fn whoever_fills_the_latch_with_slow_ones_keeps_nobody_from_halting_the_fleet() {
-        let mut engaged_stops = EngagedStops::begin(Kept::default(), Utc(0));
+        let mut engaged_stops = EngagedStops::begin(SavedState::default(), Utc(0));
         let mut engage = |level, times: usize| {
             (0..times).find_map(|_| {
                 engaged_stops.room(&Scope::Fleet, level).err().or_else(|| {
@@ -366,7 +366,7 @@ mod tests {
             }
             latch.engage(stop);
         }
-        let bytes = serde_json::to_vec(&Kept { latch, ..Kept::default() }).unwrap().len();
+        let bytes = serde_json::to_vec(&SavedState { latch, ..SavedState::default() }).unwrap().len();
         assert!(bytes < limits::STOP_LATCH_BYTES * 3 / 4, "{bytes}");
     }
 }

@@ -4,7 +4,7 @@
 //! stopped too. What cannot be read is moved aside and kept. Nobody changes a folder that another process has.
 
 use crate::audit::{self, Action, Audit, Note};
-use crate::engaged::{Kept, draw_unused};
+use crate::engaged::{SavedState, draw_unused};
 use crate::error::Error;
 use crate::first_start::{FIRST, withdraw_first_start};
 use crate::folder::LATCH;
@@ -21,8 +21,8 @@ use std::path::Path;
 
 /// A folder that is open.
 pub struct Opened {
-    /// What was kept.
-    pub kept: Kept,
+    /// The state that was saved there.
+    pub saved: SavedState,
     /// Its one writer.
     pub writer: Writer,
     /// The service's own mark.
@@ -80,28 +80,28 @@ pub fn open(folder: &Path, now: Utc) -> Result<Opened, Error> {
         (false, Some(Lost::KeyGone)) => Some(Lost::Folder),
         (false, _) => Some(Lost::LatchGone),
     };
-    let mut first = Kept::default();
+    let mut first = SavedState::default();
     if let Some(lost) = lost {
         stop_fleet(&mut first, &key, lost, now);
     }
     let mut aside = None;
-    let (mut file, mut kept) = match LatchFile::open(&path, room, first) {
+    let (mut file, mut saved) = match LatchFile::open(&path, room, first) {
         Err(midshift_latch::Error::Unreadable { .. } | midshift_latch::Error::Foreign { .. }) => {
             aside = Some(audit::set_aside(&path, now).map_err(failed)?);
             lost = Some(Lost::LatchTorn);
-            let mut first = Kept::default();
+            let mut first = SavedState::default();
             stop_fleet(&mut first, &key, Lost::LatchTorn, now);
             LatchFile::open(&path, room, first)?
         }
         opened => opened?,
     };
     // A first start that was cut short left a latch that nobody has ever written to.
-    let is_cut = is_announced && file.generation() == 0 && kept == Kept::default();
+    let is_cut = is_announced && file.generation() == 0 && saved == SavedState::default();
     let lost = lost.or(key_lost.filter(|_| !is_cut));
     let mut notes = Vec::new();
     if let Some(lost) = lost {
-        let stop = stop_fleet(&mut kept, &key, lost, now);
-        file.write(&kept)?;
+        let stop = stop_fleet(&mut saved, &key, lost, now);
+        file.write(&saved)?;
         tracing::error!(why = lost.why(), stop_id = %stop.stop_id, "THE MEMORY OF STOPS WAS LOST: the whole fleet is stopped until this stop is reset by name");
         let note = Note::own(now, lost.action()).with("stop_id", &stop.stop_id).with("why", lost.why());
         notes.push(aside.iter().fold(note, |note, aside| note.with("moved_to", aside.display())));
@@ -110,30 +110,30 @@ pub fn open(folder: &Path, now: Utc) -> Result<Opened, Error> {
         key.write_into(folder, now).map_err(failed)?;
     }
     withdraw_first_start(folder).map_err(failed)?;
-    let (audit, found) = Audit::open(folder, kept.audit.clone(), now);
+    let (audit, found) = Audit::open(folder, saved.audit.clone(), now);
     if !found.is_empty() {
         tracing::error!("the end of the audit of stops was gone or not whole");
     }
     notes.extend(found);
-    let known = kept.audit.clone();
+    let known = saved.audit.clone();
     let _holder = Holder::of_folder(folder).map_err(failed)?;
-    Ok(Opened { kept, writer: Writer { _holder, file, audit, known }, key, notes })
+    Ok(Opened { saved, writer: Writer { _holder, file, audit, known }, key, notes })
 }
 
 /// Nobody knows what was engaged: everything is. One such stop that nobody has reset is enough.
-fn stop_fleet(kept: &mut Kept, key: &Key, lost: Lost, now: Utc) -> Stop {
+fn stop_fleet(saved: &mut SavedState, key: &Key, lost: Lost, now: Utc) -> Stop {
     let is_known = |stop: &&Stop| is_memory_lost(&stop.stop_id) && stop.scope == Scope::Fleet;
-    if let Some(known) = kept.latch.effective().find(is_known) {
+    if let Some(known) = saved.latch.effective().find(is_known) {
         return known.clone();
     }
-    let stop_id = draw_unused(&kept.latch, MEMORY_LOST, now);
+    let stop_id = draw_unused(&saved.latch, MEMORY_LOST, now);
     let mut stop = Stop {
         actor: audit::MIDSHIFT.to_owned(),
         reason: format!("the stop service began without its memory: {}; nobody knows what was engaged", lost.why()),
         ..Stop::new(stop_id, Scope::Fleet, StopLevel::Halt, now)
     };
     key.mark(&mut stop);
-    kept.latch.engage(stop.clone());
+    saved.latch.engage(stop.clone());
     stop
 }
 

@@ -57,7 +57,7 @@ impl StopService {
             site_index: SiteIndex::of_site(site.as_deref()),
             key: opened.key,
             fan: Mutex::new(()),
-            engaged_stops: Mutex::new(EngagedStops::begin(opened.kept, now.wall)),
+            engaged_stops: Mutex::new(EngagedStops::begin(opened.saved, now.wall)),
             robots: Robots::default(),
             disk: Disk::default(),
             changed: watch::Sender::new(0),

@@ -4,7 +4,7 @@
 
 use crate::audit::{Audit, Note, Tail};
 use crate::changes;
-use crate::engaged::Kept;
+use crate::engaged::SavedState;
 use crate::holder::Holder;
 use crate::inner::Inner;
 use crate::threads::{blocking, lock};
@@ -33,9 +33,9 @@ struct Turn {
 }
 
 impl Writer {
-    fn turn(&mut self, kept: Option<Kept>, notes: Vec<Note>, now: Utc) -> Turn {
-        let latch = match &kept {
-            Some(kept) => self.file.write(kept).map(|()| self.known = kept.audit.clone()),
+    fn turn(&mut self, saved: Option<SavedState>, notes: Vec<Note>, now: Utc) -> Turn {
+        let latch = match &saved {
+            Some(saved) => self.file.write(saved).map(|()| self.known = saved.audit.clone()),
             None => Ok(()),
         };
         let audit = match notes.is_empty() {
@@ -88,10 +88,10 @@ pub async fn write_until_end(inner: &Arc<Inner>, mut writer: Writer) {
 
 async fn turn(inner: &Arc<Inner>, mut writer: Writer, version: u64, is_due: bool) -> (Writer, Refusing) {
     let now = inner.clock.now().wall;
-    let kept = is_due.then(|| lock(&inner.engaged_stops).kept(writer.audit.tail().clone()));
+    let saved = is_due.then(|| lock(&inner.engaged_stops).state_to_save(writer.audit.tail().clone()));
     let (notes, queued) = inner.disk.take_notes(now);
     let (back, turn) = blocking(move || {
-        let turn = writer.turn(kept, notes, now);
+        let turn = writer.turn(saved, notes, now);
         (writer, turn)
     })
     .await;
