@@ -83,22 +83,22 @@ impl RobotStop {
         self.kept.latch.effective().any(|stop| matches!(stop.scope, Scope::Zone(_) | Scope::Area(_)))
     }
 
-    /// The stop service has said all that is effective now. Whether anything is new.
-    pub fn told_all(&mut self, all: Latch) -> bool {
+    /// Merges the whole latch of the stop service. Returns whether anything is new.
+    pub fn merge_snapshot(&mut self, all: Latch) -> bool {
         self.is_told = true;
         self.kept.latch.merge(all)
     }
 
-    /// It has said something since. Whether it is new.
-    pub fn told(&mut self, stops: Vec<Stop>, resets: Vec<Reset>) -> bool {
+    /// Merges stops and resets that the stop service sent since then. Returns whether anything is new.
+    pub fn merge_changes(&mut self, stops: Vec<Stop>, resets: Vec<Reset>) -> bool {
         let engaged = stops.into_iter().fold(false, |new, stop| self.kept.latch.engage(stop) | new);
-        // Whoever keeps it needs its mark no more.
+        // A reset that is saved needs its mark no more.
         let resets = resets.into_iter().map(|reset| Reset { proof: Vec::new(), ..reset });
         resets.fold(engaged, |new, reset| self.kept.latch.reset(reset) | new)
     }
 
-    /// The stop service has said the key of its marks; empty: it says nothing new. Whether it is another one.
-    pub fn marked_by(&mut self, key: Vec<u8>) -> bool {
+    /// Sets the key of the stop service's marks; empty: the key stays. Returns whether it is another one.
+    pub fn set_mark_key(&mut self, key: Vec<u8>) -> bool {
         let is_new = !key.is_empty() && key != self.kept.key;
         if is_new {
             self.kept.key = key;
@@ -106,18 +106,18 @@ impl RobotStop {
         is_new
     }
 
-    /// Takes stops and resets from a sender other than the stop service. Returns whether anything is new.
+    /// Merges stops and resets that another sender than the stop service relayed. Returns whether anything is new.
     /// 1. Every stop counts.
     /// 2. A reset counts if `is_marked` confirms the stop service's mark and it is not older than its stop.
     /// 3. Absence proves nothing: a missing stop is not over, and `is_told` stays as it was.
-    pub fn told_beside(&mut self, stops: Vec<Stop>, resets: Vec<Reset>, is_marked: impl Fn(&Reset) -> bool) -> bool {
-        let engaged = self.told(stops, Vec::new());
+    pub fn merge_relayed(&mut self, stops: Vec<Stop>, resets: Vec<Reset>, is_marked: impl Fn(&Reset) -> bool) -> bool {
+        let engaged = self.merge_changes(stops, Vec::new());
         let latch = &self.kept.latch;
         let is_older =
             |reset: &Reset| latch.stop(&reset.stop_id).is_some_and(|stop| reset.reset_unix_ms < stop.engaged_unix_ms);
         let counts = |reset: &Reset| latch.reset_of(&reset.stop_id).is_none() && !is_older(reset) && is_marked(reset);
         let resets: Vec<Reset> = resets.into_iter().filter(counts).collect();
-        self.told(Vec::new(), resets) || engaged
+        self.merge_changes(Vec::new(), resets) || engaged
     }
 
     /// The check-in that was sent at `sent` has its answer.
@@ -212,7 +212,7 @@ mod tests {
     /// Told of nothing, and answered in each second up to and with the third.
     fn free() -> RobotStop {
         let mut robot = RobotStop::begin(robot(), Kept::default(), LinkTime(0));
-        robot.told_all(Latch::default());
+        robot.merge_snapshot(Latch::default());
         (1..4).for_each(|s| robot.answered(LinkTime(s * 1000)));
         assert_eq!(robot.advance(&at(3_000), None, Around::People).level, StopLevel::None);
         robot
@@ -224,7 +224,7 @@ mod tests {
         assert_eq!(robot.advance(&at(0), None, Around::Robots).level, StopLevel::Halt);
         (1..4).for_each(|s| robot.answered(LinkTime(s * 1000)));
         assert_eq!(robot.advance(&at(3_000), None, Around::Robots).level, StopLevel::Halt, "answered, and not told");
-        robot.told_all(Latch::default());
+        robot.merge_snapshot(Latch::default());
         assert_eq!(robot.advance(&at(3_000), None, Around::Robots).level, StopLevel::None);
         assert!(robot.kept().awaiting.is_empty(), "a start is no stop");
     }
@@ -232,7 +232,7 @@ mod tests {
     #[test]
     fn a_start_among_people_is_no_silence_however_long_it_takes_to_be_answered() {
         let mut robot = RobotStop::begin(robot(), Kept::default(), LinkTime(0));
-        robot.told_all(Latch::default());
+        robot.merge_snapshot(Latch::default());
         for ms in [0, 5_000, 60_000] {
             assert_eq!(robot.advance(&at(ms), None, Around::People).level, StopLevel::Halt);
         }
@@ -244,15 +244,15 @@ mod tests {
     #[test]
     fn what_another_than_the_stop_service_says_stops_and_frees_nothing_without_a_mark() {
         let mut robot = free();
-        assert!(robot.told_beside(vec![stop(1, StopLevel::Halt)], vec![], |_| true));
-        assert!(!robot.told_beside(vec![stop(1, StopLevel::Halt)], vec![], |_| true), "twice is once");
+        assert!(robot.merge_relayed(vec![stop(1, StopLevel::Halt)], vec![], |_| true));
+        assert!(!robot.merge_relayed(vec![stop(1, StopLevel::Halt)], vec![], |_| true), "twice is once");
         assert_eq!(robot.advance(&at(3_100), None, Around::Robots).level, StopLevel::Halt);
-        let older = Reset { reset_unix_ms: Utc(0), ..reset(1) };
-        assert!(!robot.told_beside(vec![], vec![reset(1)], |_| false), "not marked");
-        assert!(!robot.told_beside(vec![], vec![older], |_| true), "older than its stop");
-        assert!(!robot.told_beside(vec![], vec![], |_| true), "absence");
+        let older = Reset { at: Utc(0), ..reset(1) };
+        assert!(!robot.merge_relayed(vec![], vec![reset(1)], |_| false), "not marked");
+        assert!(!robot.merge_relayed(vec![], vec![older], |_| true), "older than its stop");
+        assert!(!robot.merge_relayed(vec![], vec![], |_| true), "absence");
         assert!(robot.kept().latch.is_effective(&id(1)));
-        assert!(robot.told_beside(vec![], vec![Reset { proof: vec![1], ..reset(1) }], |_| true));
+        assert!(robot.merge_relayed(vec![], vec![Reset { proof: vec![1], ..reset(1) }], |_| true));
         assert_eq!(robot.kept().latch.reset_of(&id(1)), Some(&reset(1)), "its mark is not kept");
         assert_eq!(robot.advance(&at(3_200), None, Around::Robots).level, StopLevel::Halt, "it waits for a person");
     }
@@ -266,7 +266,7 @@ mod tests {
         });
         let (last, posture) = (StopId::parse("STOP-Z").expect("an id"), StopLevel::ControlledStopPosture);
         let halts = [stop(9, StopLevel::Halt), Stop { stop_id: last.clone(), ..stop(0, posture) }];
-        robot.told(slow.chain(halts).collect(), vec![]);
+        robot.merge_changes(slow.chain(halts).collect(), vec![]);
         let obeyed = robot.advance(&at(3_100), None, Around::Robots);
         assert_eq!((obeyed.level, obeyed.inside.len()), (posture, limits::STOPS_MAX + 2));
         assert_eq!(obeyed.inside[..2], [last, id(9)]);
@@ -275,9 +275,9 @@ mod tests {
     #[test]
     fn slow_ends_with_its_reset_and_asks_for_no_resume() {
         let mut robot = free();
-        robot.told(vec![stop(1, StopLevel::Slow)], vec![]);
+        robot.merge_changes(vec![stop(1, StopLevel::Slow)], vec![]);
         assert_eq!(robot.advance(&at(3_100), None, Around::Robots).level, StopLevel::Slow);
-        robot.told(vec![], vec![reset(1)]);
+        robot.merge_changes(vec![], vec![reset(1)]);
         assert_eq!(robot.advance(&at(3_200), None, Around::Robots).level, StopLevel::None);
     }
 
@@ -333,15 +333,15 @@ mod tests {
         let silences = (0..2 * limits::STOPS_MAX).map(|n| StopId::parse(&format!("{SILENCE}r1-{n}")).expect("an id"));
         let kept = Kept { awaiting: silences.collect(), ..Kept::default() };
         let mut full_of_silences = RobotStop::begin(robot(), kept, LinkTime(0));
-        full_of_silences.told(vec![stop(1, StopLevel::Halt)], vec![]);
+        full_of_silences.merge_changes(vec![stop(1, StopLevel::Halt)], vec![]);
         let obeyed = full_of_silences.advance(&at(100), None, Around::Robots);
         assert_eq!((obeyed.inside, full_of_silences.awaiting(limits::STOPS_MAX)[0].clone()), (vec![id(1)], id(1)));
         let mut full_of_stops = free();
         let named = |n: usize| StopId::parse(&format!("STOP-A{n}")).expect("an id");
         let many = (0..2 * limits::STOPS_MAX).map(|n| Stop { stop_id: named(n), ..stop(0, StopLevel::Halt) });
-        full_of_stops.told(many.collect(), vec![]);
+        full_of_stops.merge_changes(many.collect(), vec![]);
         full_of_stops.advance(&at(3_100), None, Around::Robots);
-        full_of_stops.told(vec![stop(2, StopLevel::ControlledStopPosture)], vec![]);
+        full_of_stops.merge_changes(vec![stop(2, StopLevel::ControlledStopPosture)], vec![]);
         let obeyed = full_of_stops.advance(&at(3_200), None, Around::Robots);
         assert_eq!((obeyed.level, &obeyed.inside[0]), (StopLevel::ControlledStopPosture, &id(2)));
         assert!(full_of_stops.kept().awaiting.contains(&id(2)));
@@ -350,10 +350,10 @@ mod tests {
     #[test]
     fn a_resume_that_overtakes_the_reset_waits_for_it() {
         let mut robot = free();
-        robot.told(vec![stop(1, StopLevel::Halt)], vec![]);
+        robot.merge_changes(vec![stop(1, StopLevel::Halt)], vec![]);
         robot.advance(&at(3_100), None, Around::Robots);
         assert!(!robot.resumed(&[id(1)].into()));
-        robot.told(vec![], vec![reset(1)]);
+        robot.merge_changes(vec![], vec![reset(1)]);
         assert_eq!(robot.advance(&at(3_200), None, Around::Robots).level, StopLevel::Halt);
         assert!(robot.resumed(&[id(1)].into()));
         assert_eq!(robot.advance(&at(3_300), None, Around::Robots).level, StopLevel::None);
@@ -402,10 +402,10 @@ mod tests {
                     if latch.stop(&id(n)).is_none() && latch.reset_of(&id(n)).is_none() {
                         next.facts[usize::from(n) - 1] = Default::default();
                     }
-                    next.robot.told(vec![stop(n, StopLevel::Halt)], vec![]);
+                    next.robot.merge_changes(vec![stop(n, StopLevel::Halt)], vec![]);
                 }
                 Happens::Reset(n) => {
-                    next.robot.told(vec![], vec![reset(n)]);
+                    next.robot.merge_changes(vec![], vec![reset(n)]);
                     next.facts[usize::from(n) - 1].1 = true;
                 }
                 Happens::Resumed(n) => {
@@ -418,7 +418,7 @@ mod tests {
                     next.robot.resumed(&silences);
                 }
                 Happens::ToldAll => {
-                    next.robot.told_all(Latch::default());
+                    next.robot.merge_snapshot(Latch::default());
                 }
                 Happens::Answered => {
                     (1..4).for_each(|s| next.robot.answered(LinkTime(self.link_ms + s * 1_000)));

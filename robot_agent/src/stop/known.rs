@@ -149,8 +149,8 @@ impl Stops {
                     said: None,
                 });
             }
-            StopNews::Facts { stops, resets, generation } => {
-                let is_changed = self.robot.told(stops, resets);
+            StopNews::Told { stops, resets, generation } => {
+                let is_changed = self.robot.merge_changes(stops, resets);
                 self.changed(is_changed);
                 // Before all was said, one part of it is no state of the latch.
                 if let Some(line) = self.line.as_mut().filter(|line| line.is_synced) {
@@ -158,8 +158,8 @@ impl Stops {
                 }
             }
             StopNews::Synced { generation, key } => {
-                let is_changed = self.robot.told_all(Latch::default());
-                let is_changed = self.robot.marked_by(key) || is_changed;
+                let is_changed = self.robot.merge_snapshot(Latch::default());
+                let is_changed = self.robot.set_mark_key(key) || is_changed;
                 self.changed(is_changed);
                 if let Some(line) = &mut self.line {
                     line.is_synced = true;
@@ -187,7 +187,7 @@ impl Stops {
     /// no wait for the first words on that line.
     pub(crate) fn take_link_facts(&mut self, facts: StopFacts) {
         let key = self.kept().key.clone();
-        let is_changed = self.robot.told_beside(facts.stops, facts.resets, |reset| is_marked(&key, reset));
+        let is_changed = self.robot.merge_relayed(facts.stops, facts.resets, |reset| is_marked(&key, reset));
         self.changed(is_changed);
     }
 

@@ -78,7 +78,7 @@ fn all_news() -> Vec<News> {
 fn hear_news(robot: &mut RobotStop, news: &News) -> bool {
     let now = Now { link: LinkTime(10), site: SiteTime(10), utc: Utc(1_000), wall: Utc(1_000), jump: None };
     let is_new = match news {
-        News::Told(stops, resets) => robot.told(stops.clone(), resets.clone()),
+        News::Told(stops, resets) => robot.merge_changes(stops.clone(), resets.clone()),
         News::Resumed(stop_id) => robot.resumed(&[stop_id.clone()].into()),
         News::Restart => {
             *robot = begun(robot.kept().clone());

@@ -294,7 +294,7 @@ impl Parties {
         let known = Known { awaiting: robot.known.awaiting & !own, ..robot.known };
         let mut stop = RobotStop::begin(robot_id(at), self.kept(at, known), LinkTime(0));
         if robot.told {
-            stop.told_all(Latch::default());
+            stop.merge_snapshot(Latch::default());
         }
         if robot.stage != Stage::Begun {
             (1..4).for_each(|s| stop.answered(LinkTime(s * 1_000)));
@@ -465,7 +465,7 @@ impl Parties {
                 let whole = line.whole;
                 self.hear_news(at, robot, whole);
                 self.happens(at, robot, robot.stage, |stop| {
-                    stop.told_all(Latch::default());
+                    stop.merge_snapshot(Latch::default());
                 });
             }
             Action::HearStop { robot, stop } => {
@@ -515,7 +515,7 @@ impl Parties {
         let resets = self.resets(robot.known.facts, news.reset);
         let (told, over) = (numbers(resets).map(reset_of).collect(), self.ids(at, resets));
         self.happens(at, robot, robot.stage, |stop| {
-            stop.told(stops, told);
+            stop.merge_changes(stops, told);
             if self.is(Naive::ResetResumes) {
                 stop.resumed(&over);
             }
