@@ -17,8 +17,8 @@ use midshift_agent::session::{self, AgentConfig, Lines};
 use midshift_agent::sets;
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::start_policy::HANG_SECONDS;
-use midshift_agent::stop::keep::{FileStops, KeepStops, MemoryStops, STOP_FILE};
 use midshift_agent::stop::line::StopLine;
+use midshift_agent::stop::storage::{FileStops, MemoryStops, STOP_FILE, StopStorage};
 use midshift_agent::store::{self, Store};
 use midshift_agent::tls::Tls;
 use midshift_agent::trust::Trust;
@@ -376,7 +376,7 @@ impl Life {
     fn stop_line(&self) -> Result<Option<StopLine>, Error> {
         let Some(dial) = &self.config.stop else { return Ok(None) };
         let robot_id = self.robot.robot_id();
-        let keep: Box<dyn KeepStops> = match &self.config.persistence {
+        let storage: Box<dyn StopStorage> = match &self.config.persistence {
             Persistence::Memory => Box::new(self.stops.clone()),
             Persistence::Dir(dir) => {
                 let dir = dir.join(robot_id.as_str());
@@ -384,7 +384,7 @@ impl Life {
                 Box::new(FileStops::new(&dir.join(STOP_FILE)))
             }
         };
-        Ok(Some(StopLine { dial: dial(robot_id, self.robot.stop_network())?, keep }))
+        Ok(Some(StopLine { dial: dial(robot_id, self.robot.stop_network())?, storage }))
     }
     async fn store(&self) -> Result<Box<dyn Store>, Error> {
         let Persistence::Dir(dir) = &self.config.persistence else { return Ok(Box::new(self.memory.clone())) };

@@ -14,9 +14,9 @@ use crate::time::{LinkTime, Now, Utc};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
-/// What survives the end of the agent.
+/// The stops that an agent saves, so that they survive its end.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Kept {
+pub struct SavedStops {
     /// Stops and resets it was told of.
     pub latch: Latch,
     /// What stood it and was not resumed: stops, reset or not, and silences among people.
@@ -35,7 +35,7 @@ pub struct Obeyed {
     pub inside: Vec<StopId>,
     /// How far the silence has come.
     pub stage: Stage,
-    /// [`Kept`] has changed and must be kept again.
+    /// [`SavedStops`] has changed and must be saved again.
     pub is_changed: bool,
 }
 
@@ -43,7 +43,7 @@ pub struct Obeyed {
 #[derive(Clone, Debug)]
 pub struct RobotStop {
     robot_id: RobotId,
-    kept: Kept,
+    saved: SavedStops,
     ladder: Ladder,
     is_told: bool,
     /// It was answered often enough since it began that a silence is one.
@@ -52,14 +52,14 @@ pub struct RobotStop {
 }
 
 impl RobotStop {
-    /// A robot that begins with what it has kept.
-    pub fn begin(robot_id: RobotId, kept: Kept, now: LinkTime) -> Self {
-        Self { robot_id, kept, ladder: Ladder::begin(now), is_told: false, was_heard: false, silence: None }
+    /// A robot that begins with its saved stops.
+    pub fn begin(robot_id: RobotId, saved: SavedStops, now: LinkTime) -> Self {
+        Self { robot_id, saved, ladder: Ladder::begin(now), is_told: false, was_heard: false, silence: None }
     }
 
-    /// What must survive.
-    pub fn kept(&self) -> &Kept {
-        &self.kept
+    /// The stops that must be saved.
+    pub fn saved(&self) -> &SavedStops {
+        &self.saved
     }
 
     /// The stop service has said all that is effective since it began.
@@ -69,7 +69,7 @@ impl RobotStop {
 
     /// What waits for a person, at most `most`: a list that is cut loses silences before it loses a stop.
     pub fn awaiting(&self, most: usize) -> Vec<StopId> {
-        let (silences, stops): (Vec<&StopId>, Vec<&StopId>) = self.kept.awaiting.iter().partition(|id| is_silence(id));
+        let (silences, stops): (Vec<&StopId>, Vec<&StopId>) = self.saved.awaiting.iter().partition(|id| is_silence(id));
         stops.into_iter().chain(silences).take(most).cloned().collect()
     }
 
@@ -80,28 +80,28 @@ impl RobotStop {
 
     /// A stop for a part of the site is effective: driving alone may bring the robot into it.
     pub fn has_parts(&self) -> bool {
-        self.kept.latch.effective().any(|stop| matches!(stop.scope, Scope::Zone(_) | Scope::Area(_)))
+        self.saved.latch.effective().any(|stop| matches!(stop.scope, Scope::Zone(_) | Scope::Area(_)))
     }
 
     /// Merges the whole latch of the stop service. Returns whether anything is new.
     pub fn merge_snapshot(&mut self, all: Latch) -> bool {
         self.is_told = true;
-        self.kept.latch.merge(all)
+        self.saved.latch.merge(all)
     }
 
     /// Merges stops and resets that the stop service sent since then. Returns whether anything is new.
     pub fn merge_changes(&mut self, stops: Vec<Stop>, resets: Vec<Reset>) -> bool {
-        let engaged = stops.into_iter().fold(false, |new, stop| self.kept.latch.engage(stop) | new);
+        let engaged = stops.into_iter().fold(false, |new, stop| self.saved.latch.engage(stop) | new);
         // A reset that is saved needs its mark no more.
         let resets = resets.into_iter().map(|reset| Reset { proof: Vec::new(), ..reset });
-        resets.fold(engaged, |new, reset| self.kept.latch.reset(reset) | new)
+        resets.fold(engaged, |new, reset| self.saved.latch.reset(reset) | new)
     }
 
     /// Sets the key of the stop service's marks; empty: the key stays. Returns whether it is another one.
     pub fn set_mark_key(&mut self, key: Vec<u8>) -> bool {
-        let is_new = !key.is_empty() && key != self.kept.key;
+        let is_new = !key.is_empty() && key != self.saved.key;
         if is_new {
-            self.kept.key = key;
+            self.saved.key = key;
         }
         is_new
     }
@@ -112,9 +112,8 @@ impl RobotStop {
     /// 3. Absence proves nothing: a missing stop is not over, and `is_told` stays as it was.
     pub fn merge_relayed(&mut self, stops: Vec<Stop>, resets: Vec<Reset>, is_marked: impl Fn(&Reset) -> bool) -> bool {
         let engaged = self.merge_changes(stops, Vec::new());
-        let latch = &self.kept.latch;
-        let is_older =
-            |reset: &Reset| latch.stop(&reset.stop_id).is_some_and(|stop| reset.reset_unix_ms < stop.engaged_unix_ms);
+        let latch = &self.saved.latch;
+        let is_older = |reset: &Reset| latch.stop(&reset.stop_id).is_some_and(|stop| reset.at < stop.engaged);
         let counts = |reset: &Reset| latch.reset_of(&reset.stop_id).is_none() && !is_older(reset) && is_marked(reset);
         let resets: Vec<Reset> = resets.into_iter().filter(counts).collect();
         self.merge_changes(Vec::new(), resets) || engaged
@@ -127,7 +126,7 @@ impl RobotStop {
 
     /// People resumed these. One whose stop is still effective here waits for its reset. Whether anything changed.
     pub fn resumed(&mut self, stop_ids: &BTreeSet<StopId>) -> bool {
-        let Kept { latch, awaiting, .. } = &mut self.kept;
+        let SavedStops { latch, awaiting, .. } = &mut self.saved;
         let before = awaiting.len();
         awaiting.retain(|id| !stop_ids.contains(id) || latch.is_effective(id));
         awaiting.len() < before
@@ -135,18 +134,18 @@ impl RobotStop {
 
     /// What to do at `now`, standing or driving at `pose`.
     pub fn advance(&mut self, now: &Now, pose: Option<&Pose>, around: Around) -> Obeyed {
-        let mut is_changed = self.kept.latch.forget(now.wall, limits::RESETS_MAX);
+        let mut is_changed = self.saved.latch.forget(now.wall, limits::RESETS_MAX);
         let stage = self.ladder.advance(now.link, around);
         self.was_heard |= stage < Stage::Stand;
         let mut over: Vec<(StopId, StopLevel)> =
-            self.kept.latch.over(&self.robot_id, pose).map(|stop| (stop.stop_id.clone(), stop.level)).collect();
+            self.saved.latch.over(&self.robot_id, pose).map(|stop| (stop.stop_id.clone(), stop.level)).collect();
         over.sort_by_key(|(_, level)| std::cmp::Reverse(*level));
         for (stop_id, _) in over.iter().filter(|(_, level)| *level >= StopLevel::Halt) {
-            is_changed |= self.kept.awaiting.insert(stop_id.clone());
+            is_changed |= self.saved.awaiting.insert(stop_id.clone());
         }
         is_changed |= self.silent(stage, around, now.wall);
         let stops = over.iter().map(|(_, level)| *level).max().unwrap_or_default();
-        let held = if self.kept.awaiting.is_empty() { StopLevel::None } else { StopLevel::Halt };
+        let held = if self.saved.awaiting.is_empty() { StopLevel::None } else { StopLevel::Halt };
         let silence = match stage {
             Stage::Heard => StopLevel::None,
             Stage::Slow => StopLevel::Slow,
@@ -165,13 +164,13 @@ impl RobotStop {
             self.silence = None;
             return false;
         }
-        let has_name = self.silence.is_some() || self.kept.awaiting.iter().any(is_silence);
+        let has_name = self.silence.is_some() || self.saved.awaiting.iter().any(is_silence);
         if !self.is_told || !self.was_heard || around == Around::Robots || has_name {
             return false;
         }
         let named = format!("{SILENCE}{}-{}", self.robot_id, wall.0);
         self.silence = StopId::parse(&named).ok();
-        self.silence.clone().is_some_and(|id| self.kept.awaiting.insert(id))
+        self.silence.clone().is_some_and(|id| self.saved.awaiting.insert(id))
     }
 }
 
@@ -211,7 +210,7 @@ mod tests {
 
     /// Told of nothing, and answered in each second up to and with the third.
     fn free() -> RobotStop {
-        let mut robot = RobotStop::begin(robot(), Kept::default(), LinkTime(0));
+        let mut robot = RobotStop::begin(robot(), SavedStops::default(), LinkTime(0));
         robot.merge_snapshot(Latch::default());
         (1..4).for_each(|s| robot.answered(LinkTime(s * 1000)));
         assert_eq!(robot.advance(&at(3_000), None, Around::People).level, StopLevel::None);
@@ -220,25 +219,25 @@ mod tests {
 
     #[test]
     fn a_robot_begins_stopped_until_it_was_told_and_answered() {
-        let mut robot = RobotStop::begin(robot(), Kept::default(), LinkTime(0));
+        let mut robot = RobotStop::begin(robot(), SavedStops::default(), LinkTime(0));
         assert_eq!(robot.advance(&at(0), None, Around::Robots).level, StopLevel::Halt);
         (1..4).for_each(|s| robot.answered(LinkTime(s * 1000)));
         assert_eq!(robot.advance(&at(3_000), None, Around::Robots).level, StopLevel::Halt, "answered, and not told");
         robot.merge_snapshot(Latch::default());
         assert_eq!(robot.advance(&at(3_000), None, Around::Robots).level, StopLevel::None);
-        assert!(robot.kept().awaiting.is_empty(), "a start is no stop");
+        assert!(robot.saved().awaiting.is_empty(), "a start is no stop");
     }
 
     #[test]
     fn a_start_among_people_is_no_silence_however_long_it_takes_to_be_answered() {
-        let mut robot = RobotStop::begin(robot(), Kept::default(), LinkTime(0));
+        let mut robot = RobotStop::begin(robot(), SavedStops::default(), LinkTime(0));
         robot.merge_snapshot(Latch::default());
         for ms in [0, 5_000, 60_000] {
             assert_eq!(robot.advance(&at(ms), None, Around::People).level, StopLevel::Halt);
         }
         (60..63).for_each(|s| robot.answered(LinkTime(s * 1000)));
         assert_eq!(robot.advance(&at(62_500), None, Around::People).level, StopLevel::None);
-        assert!(robot.kept().awaiting.is_empty());
+        assert!(robot.saved().awaiting.is_empty());
     }
 
     #[test]
@@ -251,9 +250,9 @@ mod tests {
         assert!(!robot.merge_relayed(vec![], vec![reset(1)], |_| false), "not marked");
         assert!(!robot.merge_relayed(vec![], vec![older], |_| true), "older than its stop");
         assert!(!robot.merge_relayed(vec![], vec![], |_| true), "absence");
-        assert!(robot.kept().latch.is_effective(&id(1)));
+        assert!(robot.saved().latch.is_effective(&id(1)));
         assert!(robot.merge_relayed(vec![], vec![Reset { proof: vec![1], ..reset(1) }], |_| true));
-        assert_eq!(robot.kept().latch.reset_of(&id(1)), Some(&reset(1)), "its mark is not kept");
+        assert_eq!(robot.saved().latch.reset_of(&id(1)), Some(&reset(1)), "its mark is not kept");
         assert_eq!(robot.advance(&at(3_200), None, Around::Robots).level, StopLevel::Halt, "it waits for a person");
     }
 
@@ -288,7 +287,7 @@ mod tests {
             assert_eq!(robot.advance(&at(60_000), None, around).level, StopLevel::ControlledStopPosture);
             (60..63).for_each(|s| robot.answered(LinkTime(s * 1000)));
             assert_eq!(robot.advance(&at(62_000), None, around).level, level, "{around:?}");
-            let silences = robot.kept().awaiting.clone();
+            let silences = robot.saved().awaiting.clone();
             assert_eq!(silences.len(), usize::from(around == Around::People));
             assert!(silences.iter().all(is_silence) && !is_silence(&id(1)));
             robot.resumed(&silences);
@@ -307,13 +306,13 @@ mod tests {
     fn while_one_silence_waits_for_a_resume_further_ones_add_no_name_and_the_next_has_a_new_one() {
         let mut robot = free();
         silence(&mut robot, 60);
-        let first = robot.kept().awaiting.clone();
+        let first = robot.saved().awaiting.clone();
         (2..20).for_each(|n| silence(&mut robot, n * 60));
-        assert_eq!((first.len(), &robot.kept().awaiting), (1, &first));
+        assert_eq!((first.len(), &robot.saved().awaiting), (1, &first));
         robot.resumed(&first);
         assert_eq!(robot.advance(&at(1_200_000 - 57_000), None, Around::People).level, StopLevel::None);
         silence(&mut robot, 1_200);
-        let second = robot.kept().awaiting.clone();
+        let second = robot.saved().awaiting.clone();
         assert!(second.len() == 1 && second.is_disjoint(&first), "{second:?}");
         // The first is resumed while the next one goes on: nobody has seen that one.
         let mut robot = free();
@@ -321,18 +320,18 @@ mod tests {
         robot.advance(&at(120_000), None, Around::People);
         robot.resumed(&first);
         robot.advance(&at(120_100), None, Around::People);
-        let next = robot.kept().awaiting.clone();
+        let next = robot.saved().awaiting.clone();
         assert!(next.len() == 1 && next.is_disjoint(&first), "{next:?}");
         robot.resumed(&next);
         robot.advance(&at(120_200), None, Around::People);
-        assert!(robot.kept().awaiting.is_empty(), "a person saw that one");
+        assert!(robot.saved().awaiting.is_empty(), "a person saw that one");
     }
 
     #[test]
     fn a_latch_full_of_silences_or_stops_takes_a_stop_and_names_it_before_every_silence() {
         let silences = (0..2 * limits::STOPS_MAX).map(|n| StopId::parse(&format!("{SILENCE}r1-{n}")).expect("an id"));
-        let kept = Kept { awaiting: silences.collect(), ..Kept::default() };
-        let mut full_of_silences = RobotStop::begin(robot(), kept, LinkTime(0));
+        let saved = SavedStops { awaiting: silences.collect(), ..SavedStops::default() };
+        let mut full_of_silences = RobotStop::begin(robot(), saved, LinkTime(0));
         full_of_silences.merge_changes(vec![stop(1, StopLevel::Halt)], vec![]);
         let obeyed = full_of_silences.advance(&at(100), None, Around::Robots);
         assert_eq!((obeyed.inside, full_of_silences.awaiting(limits::STOPS_MAX)[0].clone()), (vec![id(1)], id(1)));
@@ -344,7 +343,7 @@ mod tests {
         full_of_stops.merge_changes(vec![stop(2, StopLevel::ControlledStopPosture)], vec![]);
         let obeyed = full_of_stops.advance(&at(3_200), None, Around::Robots);
         assert_eq!((obeyed.level, &obeyed.inside[0]), (StopLevel::ControlledStopPosture, &id(2)));
-        assert!(full_of_stops.kept().awaiting.contains(&id(2)));
+        assert!(full_of_stops.saved().awaiting.contains(&id(2)));
     }
 
     #[test]
@@ -398,7 +397,7 @@ mod tests {
             match happens {
                 Happens::Engaged(n) => {
                     // A name that was forgotten here is a new stop.
-                    let latch = &next.robot.kept.latch;
+                    let latch = &next.robot.saved.latch;
                     if latch.stop(&id(n)).is_none() && latch.reset_of(&id(n)).is_none() {
                         next.facts[usize::from(n) - 1] = Default::default();
                     }
@@ -430,20 +429,20 @@ mod tests {
                 }
                 Happens::Forgot => wall = wall.plus_ms(2 * limits::RESETS_KEPT.as_ms()),
                 Happens::Began => {
-                    let kept = next.robot.kept().clone();
-                    next.robot = RobotStop::begin(robot(), kept, LinkTime(self.link_ms));
+                    let saved = next.robot.saved().clone();
+                    next.robot = RobotStop::begin(robot(), saved, LinkTime(self.link_ms));
                 }
             }
             let obeyed = next.robot.advance(&Now { wall, ..at(next.link_ms) }, None, next.around);
             (next.level, next.stage) = (obeyed.level, obeyed.stage);
             for (n, fact) in [1, 2].into_iter().zip(&mut next.facts) {
-                fact.0 |= next.robot.kept().awaiting.contains(&id(n));
+                fact.0 |= next.robot.saved().awaiting.contains(&id(n));
             }
             next
         }
 
         fn silences(&self) -> BTreeSet<StopId> {
-            self.robot.kept().awaiting.iter().filter(|id| is_silence(id)).cloned().collect()
+            self.robot.saved().awaiting.iter().filter(|id| is_silence(id)).cloned().collect()
         }
 
         fn is_free(&self) -> bool {
@@ -452,10 +451,10 @@ mod tests {
 
         /// All of it but the moment.
         fn key(&self) -> impl Ord + use<> {
-            let RobotStop { kept, is_told, was_heard, silence, .. } = &self.robot;
-            let of = |n| (kept.latch.stop(&id(n)).is_some(), kept.latch.reset_of(&id(n)).is_some());
+            let RobotStop { saved, is_told, was_heard, silence, .. } = &self.robot;
+            let of = |n| (saved.latch.stop(&id(n)).is_some(), saved.latch.reset_of(&id(n)).is_some());
             let around = (self.around, self.stage, silence.is_some());
-            ([of(1), of(2)], kept.awaiting.clone(), *is_told, *was_heard, around, self.facts)
+            ([of(1), of(2)], saved.awaiting.clone(), *is_told, *was_heard, around, self.facts)
         }
     }
 
@@ -466,7 +465,7 @@ mod tests {
         let others = [Happens::ToldAll, Happens::Answered, Happens::Began, Happens::Silence, Happens::Walked];
         let all: Vec<Happens> = all.chain(others).chain([Happens::Forgot, Happens::SilencesResumed]).collect();
         let first = Way {
-            robot: RobotStop::begin(robot(), Kept::default(), LinkTime(0)),
+            robot: RobotStop::begin(robot(), SavedStops::default(), LinkTime(0)),
             facts: Facts::default(),
             around: Around::Robots,
             link_ms: 0,

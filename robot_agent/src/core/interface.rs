@@ -8,7 +8,7 @@ use crate::storage::Op;
 use crate::transport::replay::Replayed;
 use crate::update::{Done, Job, UpdateConfig};
 use midshift_core::ids::RobotId;
-use midshift_core::stop::robot::Kept;
+use midshift_core::stop::robot::SavedStops;
 use midshift_core::time::{LinkTime, SiteTime};
 use midshift_proto::session::{Downlink, StatusReplay, Uplink, Welcome};
 
@@ -76,8 +76,8 @@ pub enum Output {
     CheckIn(u64, Box<CheckIn>),
     /// Make a new line to the stop service: this one does not work.
     RedialStop(&'static str),
-    /// Keep these stops and say [`StopNews::Kept`] with this number. At most one is under way.
-    KeepStops(u64, Box<Kept>),
+    /// Save these stops and report [`StopNews::Saved`] with this number. At most one is under way.
+    SaveStops(u64, Box<SavedStops>),
     /// Leave the job under way: what it has so far is kept.
     DropJob,
     /// End the process.

@@ -9,7 +9,7 @@ use super::places::Places;
 use super::throttle::Throttle;
 use super::work::{Doing, Work};
 use crate::body::{Body, BodyLimits};
-use crate::stop::Stops;
+use crate::stop::StopState;
 use crate::storage::{Kept, Op};
 use crate::transport::replay::Pace;
 use crate::update::Updater;
@@ -85,7 +85,7 @@ pub struct AgentCore {
     pub(crate) wake_site: Option<SiteTime>,
     pub(crate) update: Updater,
     /// None: it has no line to a stop service, and obeys none.
-    pub(crate) stop: Option<Box<Stops>>,
+    pub(crate) stop: Option<Box<StopState>>,
     pub(crate) authority: LinkDuration,
     pub(crate) listed_load: ListedLoad,
     pub(super) session: Option<Session>,

@@ -9,8 +9,8 @@ use super::interface::Output;
 use super::state::AgentCore;
 use super::work::{Doing, Work};
 use crate::body::BodyOrder;
-use crate::stop::keep::Loaded;
-use crate::stop::{Floor, StopNews, StopOrder, Stops};
+use crate::stop::storage::Loaded;
+use crate::stop::{Floor, StopNews, StopOrder, StopState};
 use midshift_core::ids::{AreaId, StopId};
 use midshift_core::robot::{Lane, StopLevel};
 use midshift_core::stop::Reset;
@@ -25,12 +25,12 @@ const LOOK: SiteDuration = SiteDuration(100);
 impl AgentCore {
     /// From now on it has a line to a stop service, and stands until it was told. Call before the first step.
     pub fn obeys_stops(&mut self, loaded: Loaded, now: LinkTime) {
-        self.stop = Some(Box::new(Stops::begin(self.config.robot_id.clone(), loaded, now)));
+        self.stop = Some(Box::new(StopState::begin(self.config.robot_id.clone(), loaded, now)));
     }
 
     /// Stops that it keeps and that are effective as far as it knows: what it says first on a line.
     pub fn kept_stops(&self) -> impl Iterator<Item = &midshift_core::stop::Stop> {
-        self.stop.iter().flat_map(|stop| stop.kept().latch.effective())
+        self.stop.iter().flat_map(|stop| stop.saved().latch.effective())
     }
 
     /// The level that it obeys; none without a line.
@@ -96,7 +96,7 @@ impl AgentCore {
         let says = |desired: &&DesiredWork| !desired.resumed.is_empty() && !is_observed;
         let Some(desired) = self.desired.as_ref().filter(says) else { return };
         if let Some(stop) = &mut self.stop
-            && !stop.kept().awaiting.is_empty()
+            && !stop.saved().awaiting.is_empty()
         {
             stop.resumed(&desired.resumed.iter().cloned().collect());
         }
@@ -121,7 +121,7 @@ impl AgentCore {
         let before = stop.obeyed.level;
         stop.look_around(now, pose.as_ref(), around);
         let (level, bodily) = (stop.obeyed.level, std::mem::replace(&mut stop.bodily, stop.obeyed.level));
-        let is_awaiting = !stop.kept().awaiting.is_empty();
+        let is_awaiting = !stop.saved().awaiting.is_empty();
         stop.has_stood |= level >= StopLevel::Halt;
         if level != bodily {
             self.body.obeys(now.site, level);
@@ -227,7 +227,7 @@ impl AgentCore {
         let is_still = self.body.standstill(now.site);
         let orders = self.stop.iter_mut().flat_map(|stop| stop.due_orders(now.link, is_still));
         out.extend(orders.map(|order| match order {
-            StopOrder::Keep(number, kept) => Output::KeepStops(number, kept),
+            StopOrder::Save(number, saved) => Output::SaveStops(number, saved),
             StopOrder::Redial(why) => Output::RedialStop(why),
             StopOrder::CheckIn(nonce, check_in) => Output::CheckIn(nonce, check_in),
         }));

@@ -16,8 +16,8 @@ use crate::launcher::{self, ENVIRONMENT, SWITCHED};
 use crate::session::{self, AgentConfig, Lines, Updates};
 use crate::sets::disk::DiskSets;
 use crate::sets::{self, Holdings, Sets};
-use crate::stop::keep::{FileStops, STOP_FILE};
 use crate::stop::line::StopLine;
+use crate::stop::storage::{FileStops, STOP_FILE};
 use crate::storage::sqlite::SqliteStore;
 use crate::storage::{Store, store};
 use crate::transport::bulk::Bulk;
@@ -334,7 +334,7 @@ impl Machine {
         let stop = match config.stop.address(&config.server, tls.is_some()) {
             Some(address) => Some(StopLine {
                 dial: Arc::new(dial(&address, stop_network)?),
-                keep: Box::new(FileStops::new(&config.data.join(STOP_FILE))),
+                storage: Box::new(FileStops::new(&config.data.join(STOP_FILE))),
             }),
             None => None,
         };

@@ -11,8 +11,8 @@ use crate::body::Body;
 use crate::bugs::Bugs;
 use crate::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
 use crate::sets::Holdings;
-use crate::stop::keep::unreadable;
 use crate::stop::line::{Line, Said, StopLine};
+use crate::stop::storage::unreadable;
 use crate::stop::{CheckIn, StopNews};
 use crate::storage::DeviceKey;
 use crate::storage::{Op, Store, store};
@@ -324,7 +324,9 @@ impl Agent {
                 Output::Replay(replay) => self.replay(*replay),
                 Output::CheckIn(nonce, check_in) => self.check_in(nonce, &check_in),
                 Output::RedialStop(why) => self.stop.iter_mut().for_each(|line| line.redial(why)),
-                Output::KeepStops(number, kept) => self.stop.iter_mut().for_each(|line| line.keep_stops(number, &kept)),
+                Output::SaveStops(number, saved) => {
+                    self.stop.iter_mut().for_each(|line| line.save_stops(number, &saved))
+                }
                 Output::Job(job) => self.work_on(*job),
                 Output::DropJob => self.leave.cancel(),
                 Output::Exit(reason) => self.exit = Some(reason),

@@ -5,7 +5,7 @@
 //! no queue and no disk write with them. Asked to move over it has the next line before it leaves this one. A message
 //! that cannot be read ends the line. Called by the shell alone.
 
-use super::keep::{self, KeepStops, Loaded};
+use super::storage::{self, Loaded, StopStorage};
 use super::{CheckIn, StopNews};
 use crate::transport::dial::{Dial, SmallCodec};
 use crate::transport::repeats::Repeats;
@@ -15,7 +15,7 @@ use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::stop::Stop;
 use midshift_core::stop::ladder::Stage;
-use midshift_core::stop::robot::Kept;
+use midshift_core::stop::robot::SavedStops;
 use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::parse;
 use midshift_proto::convert::stop::{FromStop, names};
@@ -38,8 +38,8 @@ use tonic::{Status, Streaming};
 pub struct StopLine {
     /// Makes its connections, to the stop service's own address.
     pub dial: Arc<dyn Dial>,
-    /// Keeps what must not be forgotten.
-    pub keep: Box<dyn KeepStops>,
+    /// Saves the stops that must survive the agent.
+    pub storage: Box<dyn StopStorage>,
 }
 
 /// The way the line takes.
@@ -58,8 +58,8 @@ const SOON_MS: Range<u64> = 1..500;
 /// is given up.
 const OUTBOUND: usize = 16;
 
-/// The keeper comes back from each write, with its number.
-type Written = (Box<dyn KeepStops>, u64, Result<(), keep::Error>);
+/// The storage comes back from each write, with its number.
+type Written = (Box<dyn StopStorage>, u64, Result<(), storage::Error>);
 
 /// An open line.
 pub(crate) struct Open {
@@ -103,7 +103,7 @@ pub(crate) enum Said {
     /// A message; none: the line ended.
     Heard(Option<Box<v1::AttendResponse>>),
     /// What came of a write.
-    Kept(Box<dyn KeepStops>, u64, Result<(), keep::Error>),
+    Saved(Box<dyn StopStorage>, u64, Result<(), storage::Error>),
 }
 
 /// The line of one robot.
@@ -117,15 +117,15 @@ pub(crate) struct Line {
     without: Instant,
     /// Why there is no line, as the log was told.
     refused: Repeats,
-    keeper: Option<Box<dyn KeepStops>>,
-    keeping: Option<Boxed<'static, Written>>,
+    storage: Option<Box<dyn StopStorage>>,
+    saving: Option<Boxed<'static, Written>>,
 }
 
 impl Line {
     /// Reads what was kept, and is ready to dial.
-    pub(crate) async fn begin(line: StopLine, unreadable: Kept, seed: u64) -> (Self, Loaded) {
-        let StopLine { dial, mut keep } = line;
-        let loaded = keep.load(unreadable).await;
+    pub(crate) async fn begin(line: StopLine, unreadable: SavedStops, seed: u64) -> (Self, Loaded) {
+        let StopLine { dial, mut storage } = line;
+        let loaded = storage.load(unreadable).await;
         let line = Self {
             dial,
             rng: rand::rngs::StdRng::seed_from_u64(seed ^ 0x7374_6f70),
@@ -134,20 +134,20 @@ impl Line {
             failures: 0,
             without: Instant::now(),
             refused: Repeats::default(),
-            keeper: Some(keep),
-            keeping: None,
+            storage: Some(storage),
+            saving: None,
         };
         (line, loaded)
     }
 
     /// What it brings next. May be dropped and called again at any time.
     pub(crate) async fn next(&mut self) -> Said {
-        let Self { open, way, keeping, .. } = self;
+        let Self { open, way, saving, .. } = self;
         tokio::select! {
             biased;
             message = heard(open) => Said::Heard(message.map(Box::new)),
             said = progress(way) => { *way = Way::Idle; said }
-            (keeper, number, done) = written(keeping) => { *keeping = None; Said::Kept(keeper, number, done) }
+            (storage, number, done) = written(saving) => { *saving = None; Said::Saved(storage, number, done) }
         }
     }
 
@@ -205,12 +205,12 @@ impl Line {
                     self.lost("a message cannot be read")
                 }
             },
-            Said::Kept(keeper, number, done) => {
-                self.keeper = Some(keeper);
+            Said::Saved(storage, number, done) => {
+                self.storage = Some(storage);
                 if let Err(error) = &done {
                     tracing::error!(%robot_id, %error, "stops not kept: they are obeyed all the same");
                 }
-                Some(StopNews::Kept { number, is_durable: done.is_ok() })
+                Some(StopNews::Saved { number, is_durable: done.is_ok() })
             }
         }
     }
@@ -256,13 +256,13 @@ impl Line {
         }
     }
 
-    /// Writes what must be kept beside everything else.
-    pub(crate) fn keep_stops(&mut self, number: u64, kept: &Kept) {
-        let Some(mut keeper) = self.keeper.take() else { return };
-        let kept = kept.clone();
-        self.keeping = Some(Box::pin(async move {
-            let done = keeper.save(kept).await;
-            (keeper, number, done)
+    /// Begins to write the stops, beside everything else.
+    pub(crate) fn save_stops(&mut self, number: u64, saved: &SavedStops) {
+        let Some(mut storage) = self.storage.take() else { return };
+        let saved = saved.clone();
+        self.saving = Some(Box::pin(async move {
+            let done = storage.save(saved).await;
+            (storage, number, done)
         }));
     }
 
@@ -348,8 +348,8 @@ async fn progress(way: &mut Way) -> Said {
     }
 }
 
-async fn written(keeping: &mut Option<Boxed<'static, Written>>) -> Written {
-    match keeping {
+async fn written(saving: &mut Option<Boxed<'static, Written>>) -> Written {
+    match saving {
         Some(writing) => writing.await,
         None => pending().await,
     }

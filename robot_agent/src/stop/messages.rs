@@ -3,7 +3,7 @@
 use midshift_core::ids::StopId;
 use midshift_core::robot::StopLevel;
 use midshift_core::stop::ladder::Stage;
-use midshift_core::stop::robot::Kept;
+use midshift_core::stop::robot::SavedStops;
 use midshift_core::stop::{Reset, Stop};
 
 /// What the line brings.
@@ -40,7 +40,7 @@ pub enum StopNews {
     /// There is no line any more.
     LineLost,
     /// What came of the write with this number.
-    Kept {
+    Saved {
         /// Its number.
         number: u64,
         /// It survives the end of the process.
@@ -84,8 +84,8 @@ impl CheckIn {
 /// What the shell is to do for the stop line.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum StopOrder {
-    /// Keep these stops, and say [`StopNews::Kept`] with this number.
-    Keep(u64, Box<Kept>),
+    /// Save these stops, and report [`StopNews::Saved`] with this number.
+    Save(u64, Box<SavedStops>),
     /// Make a new line: this one does not work.
     Redial(&'static str),
     /// Say this to the stop service under this number.

@@ -9,14 +9,14 @@ use midshift_agent::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
 use midshift_agent::memory::MemoryStore;
 use midshift_agent::sets::Sets;
 use midshift_agent::sets::memory::MemorySets;
-use midshift_agent::stop::keep::Loaded;
+use midshift_agent::stop::storage::Loaded;
 use midshift_agent::stop::{CheckIn, StopNews};
 use midshift_agent::update::io::{UpdateWorker, Worker};
 use midshift_agent::update::{Done, Failure, Job};
 use midshift_core::authority::Authority;
 use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId, WaypointId};
 use midshift_core::robot::{Lane, ReportedState};
-use midshift_core::stop::robot::Kept;
+use midshift_core::stop::robot::SavedStops;
 use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
 use midshift_core::update::UpdateState;
 use midshift_core::work::{
@@ -64,7 +64,7 @@ pub struct StopDesk {
     /// Its file refuses every write.
     pub disk_fails: bool,
     /// What its file holds.
-    pub kept: Kept,
+    pub saved: SavedStops,
 }
 
 /// What a robot needs to change its software, and what happens to it on the way.
@@ -171,7 +171,7 @@ impl Rig {
         let now = clocks_at(ms, updates.as_ref());
         let mut core = AgentCore::new(config, Box::new(body.clone()), kept, now);
         if stop.is_there {
-            core.obeys_stops(Loaded { kept: stop.kept.clone(), is_durable: true }, LinkTime(ms));
+            core.obeys_stops(Loaded { saved: stop.saved.clone(), is_durable: true }, LinkTime(ms));
         }
         let mut rig = Self {
             core,
@@ -231,12 +231,12 @@ impl Rig {
                     }
                     Output::CheckIn(nonce, check_in) => self.stop.check_ins.push((nonce, *check_in)),
                     Output::RedialStop(why) => self.stop.redials.push(why),
-                    Output::KeepStops(number, kept) => {
+                    Output::SaveStops(number, saved) => {
                         let is_durable = !self.stop.disk_fails;
                         if is_durable {
-                            self.stop.kept = *kept;
+                            self.stop.saved = *saved;
                         }
-                        inputs.push(Input::Stop(Box::new(StopNews::Kept { number, is_durable })));
+                        inputs.push(Input::Stop(Box::new(StopNews::Saved { number, is_durable })));
                     }
                     Output::DropJob => {}
                     Output::Send(message) => self.sent(*message),

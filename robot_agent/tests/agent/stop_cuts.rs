@@ -6,11 +6,11 @@
 #![expect(clippy::print_stdout, reason = "the one that is killed says what it has done")]
 
 use crate::strace::{Sites, Victim, killed_after, sites};
-use midshift_agent::stop::keep::{FileStops, KeepStops, Loaded, STOP_FILE, unreadable};
+use midshift_agent::stop::storage::{FileStops, Loaded, STOP_FILE, StopStorage, unreadable};
 use midshift_core::ids::{RobotId, StopId};
 use midshift_core::robot::StopLevel;
 use midshift_core::stop::ladder::Around;
-use midshift_core::stop::robot::{Kept, RobotStop};
+use midshift_core::stop::robot::{RobotStop, SavedStops};
 use midshift_core::stop::{Reset, Scope, Stop};
 use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
 use rand::SeedableRng;
@@ -81,30 +81,30 @@ fn hear_news(robot: &mut RobotStop, news: &News) -> bool {
         News::Told(stops, resets) => robot.merge_changes(stops.clone(), resets.clone()),
         News::Resumed(stop_id) => robot.resumed(&[stop_id.clone()].into()),
         News::Restart => {
-            *robot = begun(robot.kept().clone());
+            *robot = begun(robot.saved().clone());
             false
         }
     };
     robot.advance(&now, None, Around::People).is_changed | is_new
 }
 
-fn begun(kept: Kept) -> RobotStop {
-    RobotStop::begin(robot_id(), kept, LinkTime(10))
+fn begun(saved: SavedStops) -> RobotStop {
+    RobotStop::begin(robot_id(), saved, LinkTime(10))
 }
 
 /// What is kept one after the other, from `first` on.
-fn states(first: Kept) -> Vec<Kept> {
+fn states(first: SavedStops) -> Vec<SavedStops> {
     let (mut robot, mut states) = (begun(first.clone()), vec![first]);
     for news in all_news() {
         if hear_news(&mut robot, &news) {
-            states.push(robot.kept().clone());
+            states.push(robot.saved().clone());
         }
     }
     states
 }
 
 /// What a robot begins with whose file cannot be read.
-fn stands() -> Kept {
+fn stands() -> SavedStops {
     unreadable(&robot_id(), Utc(7))
 }
 
@@ -122,18 +122,18 @@ fn wait<T>(future: impl Future<Output = T>) -> T {
 fn live(folder: &Path) {
     let (mut file, loaded) = load(folder);
     assert!(loaded.is_durable);
-    println!("+{}", serde_json::to_string(&loaded.kept).expect("JSON"));
-    let mut robot = begun(loaded.kept);
+    println!("+{}", serde_json::to_string(&loaded.saved).expect("JSON"));
+    let mut robot = begun(loaded.saved);
     for news in all_news() {
         if matches!(news, News::Restart) {
             let loaded;
             drop(file);
             (file, loaded) = load(folder);
-            assert_eq!(loaded, Loaded { kept: robot.kept().clone(), is_durable: true });
+            assert_eq!(loaded, Loaded { saved: robot.saved().clone(), is_durable: true });
         }
         if hear_news(&mut robot, &news) {
-            wait(file.save(robot.kept().clone())).expect("keeps");
-            println!("+{}", serde_json::to_string(robot.kept()).expect("JSON"));
+            wait(file.save(robot.saved().clone())).expect("keeps");
+            println!("+{}", serde_json::to_string(robot.saved()).expect("JSON"));
         }
     }
 }
@@ -145,12 +145,12 @@ fn a_file_of_stops_lived_through_once_more_says_the_same() {
         return live(Path::new(&folder));
     }
     let folder = tempfile::tempdir().expect("a folder");
-    let last = states(Kept::default()).pop().expect("an end");
+    let last = states(SavedStops::default()).pop().expect("an end");
     assert!(last.latch.is_effective(&id("STOP-D")) && last.latch.effective().count() == 1);
     assert_eq!(last.awaiting, [id("STOP-D")].into());
     for _ in 0..2 {
         live(folder.path());
-        assert_eq!(load(folder.path()).1.kept, last);
+        assert_eq!(load(folder.path()).1.saved, last);
     }
 }
 
@@ -165,7 +165,7 @@ fn cut(is_broken: bool) -> usize {
         }
         folder
     };
-    let states = states(if is_broken { stands() } else { Kept::default() });
+    let states = states(if is_broken { stands() } else { SavedStops::default() });
     let last = states.last().expect("an end");
     let home = folder();
     let at = |folder: &Path| [(LIFE_IN, folder.as_os_str().to_owned())];
@@ -182,30 +182,30 @@ fn cut(is_broken: bool) -> usize {
         let home = folder();
         let victim = Victim { test: LIVES, environment: &at(home.path()), folder: home.path() };
         let said = killed_after(&victim, &paths, *cut);
-        let durable: Vec<Kept> = said
+        let durable: Vec<SavedStops> = said
             .lines()
             .filter_map(|line| line.strip_prefix('+'))
             .map(|line| serde_json::from_str(line).expect("whole"))
             .collect();
         // A restart says what it found, which was said before.
         let newest =
-            durable.last().map_or(0, |kept| states.iter().position(|state| state == kept).expect("one of them"));
+            durable.last().map_or(0, |saved| states.iter().position(|state| state == saved).expect("one of them"));
         let (_, loaded) = load(home.path());
         assert!(loaded.is_durable, "{when}");
-        let at = states.iter().position(|state| *state == loaded.kept);
+        let at = states.iter().position(|state| *state == loaded.saved);
         assert!(at.is_some_and(|at| (newest..=newest + 1).contains(&at)), "{when}: {newest} was kept, {at:?} is there");
         let beside = home.path().join(STOP_FILE).with_extension("latch.broken");
         assert!(!is_broken || fs::read(beside).is_ok_and(|bytes| bytes == BROKEN), "{when}: what was broken is kept");
         // Said once more it comes to the same, and the facts do so in any order.
-        let (mut again, mut backwards) = (begun(loaded.kept.clone()), begun(loaded.kept));
+        let (mut again, mut backwards) = (begun(loaded.saved.clone()), begun(loaded.saved));
         for news in all_news() {
             hear_news(&mut again, &news);
         }
         for news in all_news().iter().rev() {
             hear_news(&mut backwards, news);
         }
-        assert_eq!(again.kept(), last, "{when}");
-        assert_eq!(backwards.kept().latch, last.latch, "{when}");
+        assert_eq!(again.saved(), last, "{when}");
+        assert_eq!(backwards.saved().latch, last.latch, "{when}");
     }
     println!(
         "broken: {is_broken}: {found} calls change the disk; {} of them were cut; MIDSHIFT_SEED={seed}",

@@ -10,14 +10,14 @@ use midshift_agent::core::ExitReason;
 use midshift_agent::dial::{self, Dial, TcpDial};
 use midshift_agent::memory::MemoryStore;
 use midshift_agent::session::{AgentConfig, Error, Lines, run};
-use midshift_agent::stop::keep::{FileStops, KeepStops, Loaded, MemoryStops, STOP_FILE, unreadable};
 use midshift_agent::stop::line::StopLine;
+use midshift_agent::stop::storage::{FileStops, Loaded, MemoryStops, STOP_FILE, StopStorage, unreadable};
 use midshift_agent::store::{self, Op, Store};
 use midshift_core::ids::{AreaId, RobotId};
 use midshift_core::limits;
 use midshift_core::robot::StopLevel;
 use midshift_core::stop::region::Bounds;
-use midshift_core::stop::robot::Kept;
+use midshift_core::stop::robot::SavedStops;
 use midshift_core::stop::{Region, Scope, Stop};
 use midshift_core::time::Utc;
 use midshift_proto::stop::v1;
@@ -143,16 +143,21 @@ impl Bench {
     fn new() -> Self {
         Self::with(Box::new(MemoryStore::new()), Box::new(MemoryStops::default()))
     }
-    fn with(store: Box<dyn Store>, keep: Box<dyn KeepStops>) -> Self {
+    fn with(store: Box<dyn Store>, storage: Box<dyn StopStorage>) -> Self {
         let (ends, incoming) = mpsc::channel(4);
         let (seen, lines) = mpsc::channel(4);
         let server = Server::builder().add_service(StopLinkServiceServer::new(Desk(seen)));
         tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
         let dial = Arc::new(Pipes { ends, network: watch::channel(true).1 });
-        Self::over(dial, lines, store, keep)
+        Self::over(dial, lines, store, storage)
     }
-    fn over(dial: Arc<dyn Dial>, lines: mpsc::Receiver<Seen>, store: Box<dyn Store>, keep: Box<dyn KeepStops>) -> Self {
-        let config = AgentConfig { stop: Some(StopLine { dial, keep }), ..config(None) };
+    fn over(
+        dial: Arc<dyn Dial>,
+        lines: mpsc::Receiver<Seen>,
+        store: Box<dyn Store>,
+        storage: Box<dyn StopStorage>,
+    ) -> Self {
+        let config = AgentConfig { stop: Some(StopLine { dial, storage }), ..config(None) };
         let clock = clock(Utc(1_700_000_000_000));
         let (body, shutdown) = (TestBody::at("A"), CancellationToken::new());
         // The link and bulk are as bad as they can be in all of these.
@@ -229,11 +234,11 @@ async fn a_ledger_whose_disk_hangs_and_a_link_that_is_not_there_do_not_hold_a_st
 struct HungStops;
 
 #[async_trait]
-impl KeepStops for HungStops {
-    async fn load(&mut self, _: Kept) -> Loaded {
-        Loaded { kept: Kept::default(), is_durable: true }
+impl StopStorage for HungStops {
+    async fn load(&mut self, _: SavedStops) -> Loaded {
+        Loaded { saved: SavedStops::default(), is_durable: true }
     }
-    async fn save(&mut self, _: Kept) -> Result<(), midshift_agent::stop::keep::Error> {
+    async fn save(&mut self, _: SavedStops) -> Result<(), midshift_agent::stop::storage::Error> {
         std::future::pending().await
     }
 }
@@ -276,8 +281,8 @@ async fn a_service_that_is_not_there_is_dialed_each_second_for_ten_and_then_with
             Err(dial::Error("refused".into()))
         }
     }
-    let (store, keep) = (Box::new(MemoryStore::new()), Box::new(MemoryStops::default()));
-    let bench = Bench::over(Arc::new(Refused(tries)), mpsc::channel(1).1, store, keep);
+    let (store, storage) = (Box::new(MemoryStore::new()), Box::new(MemoryStops::default()));
+    let bench = Bench::over(Arc::new(Refused(tries)), mpsc::channel(1).1, store, storage);
     let mut pauses = Vec::new();
     let begun = tried.recv().await.expect("dials");
     let (mut before, mut early) = (begun, Vec::new());
@@ -446,8 +451,8 @@ async fn over_loopback_an_engaged_stop_is_kept_in_its_file_and_stands_the_robot_
     bench.agent.abort();
     let _ = bench.agent.await;
     lines = bench.lines;
-    let (_, kept): (u64, Kept) = midshift_latch::read(&path).expect("reads");
-    assert!(kept.latch.is_effective(&stop_id(1)));
+    let (_, saved): (u64, SavedStops) = midshift_latch::read(&path).expect("reads");
+    assert!(saved.latch.is_effective(&stop_id(1)));
     let mut bench = begin(lines);
     let mut line = bench.line().await;
     assert_eq!(line.attend().await.stops.len(), 1);
@@ -469,16 +474,16 @@ async fn a_file_that_cannot_be_read_stands_the_robot_until_a_person_resumes_that
     let name = first.awaiting.first().expect("a name").to_string();
     assert_eq!(name, "LATCH-rbt-01-7");
     let loaded = FileStops::new(&path).load(first.clone()).await;
-    assert_eq!(loaded, Loaded { kept: first.clone(), is_durable: true });
+    assert_eq!(loaded, Loaded { saved: first.clone(), is_durable: true });
     assert_eq!(std::fs::read_to_string(folder.path().join("stops.latch.broken")).expect("reads"), "nothing of ours");
     // It is so after the next start too, under the same name.
     let again = FileStops::new(&path).load(unreadable(&robot(), Utc(8))).await;
-    assert_eq!(again.kept, first);
+    assert_eq!(again.saved, first);
     // A folder in its place is neither read nor put away.
     let odd = folder.path().join("odd");
     std::fs::create_dir(&odd).expect("makes");
     let mut stops = FileStops::new(&odd);
-    assert_eq!(stops.load(first.clone()).await, Loaded { kept: first.clone(), is_durable: false });
+    assert_eq!(stops.load(first.clone()).await, Loaded { saved: first.clone(), is_durable: false });
     assert!(stops.save(first).await.is_err());
 }
 
@@ -487,19 +492,19 @@ async fn more_resets_than_the_file_holds_give_way_to_stops() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join(STOP_FILE);
     let mut stops = FileStops::new(&path);
-    stops.load(Kept::default()).await;
-    let mut kept = Kept::default();
+    stops.load(SavedStops::default()).await;
+    let mut saved = SavedStops::default();
     for n in 0..6_000 {
-        kept.latch.engage(stop(n, StopLevel::Halt));
-        kept.latch.reset(reset(n));
+        saved.latch.engage(stop(n, StopLevel::Halt));
+        saved.latch.reset(reset(n));
     }
-    kept.latch.engage(stop(9_999, StopLevel::Halt));
-    kept.awaiting = [stop_id(3), stop_id(9_999)].into();
-    stops.save(kept.clone()).await.expect("keeps");
+    saved.latch.engage(stop(9_999, StopLevel::Halt));
+    saved.awaiting = [stop_id(3), stop_id(9_999)].into();
+    stops.save(saved.clone()).await.expect("keeps");
     drop(stops);
-    let loaded = FileStops::new(&path).load(Kept::default()).await;
+    let loaded = FileStops::new(&path).load(SavedStops::default()).await;
     assert!(loaded.is_durable);
-    assert_eq!(loaded.kept.awaiting, kept.awaiting);
-    assert_eq!(loaded.kept.latch.effective().collect::<Vec<_>>(), kept.latch.effective().collect::<Vec<_>>());
-    assert_eq!(loaded.kept.latch.resets().count(), 0);
+    assert_eq!(loaded.saved.awaiting, saved.awaiting);
+    assert_eq!(loaded.saved.latch.effective().collect::<Vec<_>>(), saved.latch.effective().collect::<Vec<_>>());
+    assert_eq!(loaded.saved.latch.resets().count(), 0);
 }

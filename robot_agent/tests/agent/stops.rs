@@ -358,12 +358,12 @@ fn a_stop_that_cannot_be_written_is_obeyed_said_to_be_not_durable_and_written_la
     serve(&mut rig, 2_000);
     rig.silence(1_000);
     assert_eq!((said(&rig).obeys, said(&rig).is_durable), (StopLevel::Halt, false));
-    assert_eq!(rig.stop.kept.latch.stops().count(), 0);
+    assert_eq!(rig.stop.saved.latch.stops().count(), 0);
     rig.stop.disk_fails = false;
     serve(&mut rig, 2_000);
     rig.silence(1_000);
     assert!(said(&rig).is_durable);
-    assert!(rig.stop.kept.awaiting.contains(&stop_id(1)));
+    assert!(rig.stop.saved.awaiting.contains(&stop_id(1)));
 }
 
 #[test]

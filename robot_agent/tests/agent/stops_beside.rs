@@ -43,7 +43,7 @@ fn a_stop_that_is_heard_on_the_link_alone_is_obeyed_kept_and_brought_back() {
     let rig = halted();
     assert!(is_stopped(&rig));
     assert_eq!(awaiting(&rig), ["STOP-1"]);
-    assert!(rig.stop.kept.latch.is_effective(&stop_id(1)), "it is in the file");
+    assert!(rig.stop.saved.latch.is_effective(&stop_id(1)), "it is in the file");
     let rig = rig.restart();
     assert_eq!(rig.core.kept_stops().map(|stop| stop.stop_id.clone()).collect::<Vec<_>>(), [stop_id(1)]);
     assert_eq!(awaiting(&freed_of_silence(rig)), ["STOP-1"]);

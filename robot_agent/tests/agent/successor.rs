@@ -18,7 +18,7 @@ use midshift_agent::ring::Item;
 use midshift_agent::sets::Sets;
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sqlite::SqliteStore;
-use midshift_agent::stop::keep::{FileStops, KeepStops, STOP_FILE, unreadable};
+use midshift_agent::stop::storage::{FileStops, STOP_FILE, StopStorage, unreadable};
 use midshift_agent::storage::Proven;
 use midshift_agent::store::{Kept, Op, Store};
 use midshift_agent::trust::Trust;
@@ -32,7 +32,7 @@ use midshift_core::ids::{AreaId, DrainId, RobotId, SiteId};
 use midshift_core::policy::AreaPolicy;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{Lane, Mode, StopLevel, Vitals};
-use midshift_core::stop::robot::Kept as KeptStops;
+use midshift_core::stop::robot::SavedStops;
 use midshift_core::time::Utc;
 use midshift_core::update::UpdateState;
 use midshift_core::work::{AttemptReport, Gap, RobotEvent, SampleBody, StepKind, WorkState};
@@ -274,7 +274,7 @@ async fn the_latch_of_a_newer_version_is_obeyed_and_one_with_words_that_nobody_k
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join(STOP_FILE);
     let unknown = unreadable(&RobotId::parse("rbt-01").expect("a name"), Utc(7));
-    let mut known = KeptStops::default();
+    let mut known = SavedStops::default();
     known.latch.engage(stop(1, StopLevel::Halt));
     let mut stops = FileStops::new(&path);
     stops.load(unknown.clone()).await;
@@ -291,11 +291,11 @@ async fn the_latch_of_a_newer_version_is_obeyed_and_one_with_words_that_nobody_k
         page["latch"]["stops"].as_object_mut().expect("stops").values_mut().for_each(|s| s["next_version"] = json!(7));
     });
     let loaded = FileStops::new(&path).load(unknown.clone()).await;
-    assert_eq!((&loaded.kept, loaded.is_durable), (&known, true));
+    assert_eq!((&loaded.saved, loaded.is_durable), (&known, true));
     rewrites(&|page| {
         page["latch"]["stops"].as_object_mut().expect("stops").values_mut().for_each(|s| s["level"] = json!("dream"));
     });
-    assert_eq!(FileStops::new(&path).load(unknown.clone()).await.kept, unknown, "it stands until a person resumes it");
+    assert_eq!(FileStops::new(&path).load(unknown.clone()).await.saved, unknown, "it stands until a person resumes it");
     let (_, theirs) = midshift_latch::read::<Value>(&path.with_extension("latch.broken")).expect("stays beside");
     assert!(theirs.to_string().contains("dream"), "{theirs}");
 }

@@ -256,7 +256,7 @@ fn a_stop_and_its_reset_reach_agents_whose_stop_service_is_one_version_newer_or_
         let knows = |scene: &mut Scene, stops: usize| {
             scene.until(&format!("every robot to know {stops} stops"), |room| {
                 let service = room.stop.as_ref().expect("a stop service");
-                (0..ROBOTS).all(|robot| effective(&service.kept(robot).latch).len() == stops)
+                (0..ROBOTS).all(|robot| effective(&service.saved(robot).latch).len() == stops)
             });
         };
         let scope = Some(v1::Scope { scope: Some(v1::scope::Scope::Fleet(v1::Fleet {})) });

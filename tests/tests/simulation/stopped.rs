@@ -56,7 +56,7 @@ impl Watch {
         self.at.resize(ROBOTS, None);
         for robot in 0..ROBOTS {
             let state = room.hall.robots()[robot].state(now);
-            let kept = stops(room).kept(robot);
+            let kept = stops(room).saved(robot);
             let over = kept.latch.level(&room.robot_id(robot), Some(&state.pose));
             let stands = over >= StopLevel::Halt || !kept.awaiting.is_empty();
             let since = if stands { Some(self.since[robot].unwrap_or(now_ms)) } else { None };
@@ -118,11 +118,11 @@ impl Stopped {
         for _ in 0..10 {
             self.let_go();
             self.pass(5_000);
-            if (0..ROBOTS).all(|robot| self.stops().kept(robot).awaiting.is_empty()) {
+            if (0..ROBOTS).all(|robot| self.stops().saved(robot).awaiting.is_empty()) {
                 return;
             }
         }
-        panic!("a robot was not let go: {:?}", (0..ROBOTS).map(|robot| self.stops().kept(robot)).collect::<Vec<_>>());
+        panic!("a robot was not let go: {:?}", (0..ROBOTS).map(|robot| self.stops().saved(robot)).collect::<Vec<_>>());
     }
     fn line(&self, robot: usize, way: Way) {
         self.stops().steer(&self.scene.room.sim, robot, way);
@@ -132,10 +132,10 @@ impl Stopped {
     }
     /// What robots know as effective, each.
     fn known(&self) -> Vec<BTreeSet<StopId>> {
-        (0..ROBOTS).map(|robot| effective(&self.stops().kept(robot).latch)).collect()
+        (0..ROBOTS).map(|robot| effective(&self.stops().saved(robot).latch)).collect()
     }
     fn silences(&self) -> usize {
-        (0..ROBOTS).filter(|robot| self.stops().kept(*robot).awaiting.iter().any(is_silence)).count()
+        (0..ROBOTS).filter(|robot| self.stops().saved(*robot).awaiting.iter().any(is_silence)).count()
     }
     /// I11, I12: nobody moved who had to stand, and everybody knows what the service knows.
     fn assert_agrees(&self) {
@@ -244,7 +244,7 @@ fn one_of_two_is_reset(naive: Naive) -> Stopped {
     stopped.engage(fleet());
     stopped.engage(fleet());
     stopped.until("two stops at every robot", |room| {
-        (0..ROBOTS).all(|robot| effective(&stops(room).kept(robot).latch).len() == 2)
+        (0..ROBOTS).all(|robot| effective(&stops(room).saved(robot).latch).len() == 2)
     });
     stopped.line(0, Way::Cut);
     let first = stopped.effective().pop_first().expect("two are engaged");
@@ -274,7 +274,7 @@ fn a_stop_that_is_engaged_while_a_line_is_cut_reaches_its_robot_by_the_link() {
     stopped.line(0, Way::Cut);
     stopped.engage(fleet());
     stopped.until("the stop at every robot", |room| {
-        (0..ROBOTS).all(|robot| effective(&stops(room).kept(robot).latch).len() == 1)
+        (0..ROBOTS).all(|robot| effective(&stops(room).saved(robot).latch).len() == 1)
     });
     assert_eq!(stopped.silences(), 0, "nobody stands by silence");
     stopped.pass(BRAKES_MS + 2_000);
@@ -282,7 +282,7 @@ fn a_stop_that_is_engaged_while_a_line_is_cut_reaches_its_robot_by_the_link() {
     let stop_id = stopped.effective().pop_first().expect("one is engaged");
     stopped.reset(&stop_id);
     stopped.until("its reset at every robot", |room| {
-        (0..ROBOTS).all(|robot| effective(&stops(room).kept(robot).latch).is_empty())
+        (0..ROBOTS).all(|robot| effective(&stops(room).saved(robot).latch).is_empty())
     });
     stopped.line(0, Way::Open);
     stopped.pass(HEALED_MS);

@@ -5,13 +5,13 @@
 use crate::clock::{MachineClock, Skew, TrueTime};
 use crate::net::{self, Ear, STOPS, SimDial, Way, Wire, machine};
 use crate::newer::Voice;
-use midshift_agent::stop::keep::MemoryStops;
 use midshift_agent::stop::line::StopLine;
+use midshift_agent::stop::storage::MemoryStops;
 use midshift_core::identity::Caller;
 use midshift_core::ids::StopId;
 use midshift_core::site::Site;
 use midshift_core::stop::Latch;
-use midshift_core::stop::robot::Kept;
+use midshift_core::stop::robot::SavedStops;
 use midshift_stop::{Error, Parts, StopService, announce_first_start};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -29,7 +29,7 @@ const AGAIN: Duration = Duration::from_millis(200);
 /// One robot's line, and what it keeps.
 #[derive(Clone)]
 pub struct RobotLine {
-    kept: MemoryStops,
+    saved: MemoryStops,
     wire: Wire,
 }
 
@@ -37,7 +37,7 @@ impl RobotLine {
     /// For one process of the robot.
     pub fn dial(&self, machine: String, voice: Option<Voice>) -> StopLine {
         let dial = SimDial { to: STOPS, ear: Ear::default(), machine, wire: self.wire.clone(), voice };
-        StopLine { dial: Arc::new(dial), keep: Box::new(self.kept.clone()) }
+        StopLine { dial: Arc::new(dial), storage: Box::new(self.saved.clone()) }
     }
 }
 
@@ -61,7 +61,7 @@ impl Stops {
         announce_first_start(&path)?;
         let (time, site, of_service) = (time.clone(), site.clone(), wire.clone());
         sim.host(STOPS, move || live(path.clone(), site.clone(), time.clone(), of_service.clone()));
-        let lines = (0..robots).map(|_| RobotLine { kept: MemoryStops::default(), wire: wire.clone() }).collect();
+        let lines = (0..robots).map(|_| RobotLine { saved: MemoryStops::default(), wire: wire.clone() }).collect();
         Ok(Self { folder, lines, wire })
     }
     /// Where it keeps its files.
@@ -73,8 +73,8 @@ impl Stops {
         self.lines[robot].clone()
     }
     /// What one robot's file has.
-    pub fn kept(&self, robot: usize) -> Kept {
-        self.lines[robot].kept.kept()
+    pub fn saved(&self, robot: usize) -> SavedStops {
+        self.lines[robot].saved.saved()
     }
     /// What the service's file has.
     pub fn latch(&self) -> Latch {

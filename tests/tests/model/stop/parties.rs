@@ -7,7 +7,7 @@
 use midshift_core::ids::{RobotId, StopId};
 use midshift_core::robot::StopLevel;
 use midshift_core::stop::ladder::Around;
-use midshift_core::stop::robot::{Kept, RobotStop};
+use midshift_core::stop::robot::{RobotStop, SavedStops};
 use midshift_core::stop::{Latch, Reset, Scope, Stop};
 use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
 use std::collections::BTreeSet;
@@ -274,8 +274,12 @@ impl Parties {
         latch
     }
 
-    fn kept(&self, robot: usize, known: Known) -> Kept {
-        Kept { latch: self.latch(known.facts), awaiting: self.ids(robot, known.awaiting), ..Kept::default() }
+    fn saved(&self, robot: usize, known: Known) -> SavedStops {
+        SavedStops {
+            latch: self.latch(known.facts),
+            awaiting: self.ids(robot, known.awaiting),
+            ..SavedStops::default()
+        }
     }
 
     fn ids(&self, robot: usize, names: Names) -> BTreeSet<StopId> {
@@ -292,7 +296,7 @@ impl Parties {
         let silence = bit(SILENCE + usize::from(robot.silences));
         let own = if robot.stage == Stage::Silent { silence } else { 0 };
         let known = Known { awaiting: robot.known.awaiting & !own, ..robot.known };
-        let mut stop = RobotStop::begin(robot_id(at), self.kept(at, known), LinkTime(0));
+        let mut stop = RobotStop::begin(robot_id(at), self.saved(at, known), LinkTime(0));
         if robot.told {
             stop.merge_snapshot(Latch::default());
         }
@@ -320,11 +324,11 @@ impl Parties {
             _ => HEARD_MS,
         };
         let obeyed = stop.advance(&now(ms, robot.silences), None, self.patience(at));
-        let awaiting = names(stop.kept().awaiting.iter());
-        robot.known = Known { facts: facts_of(&stop.kept().latch), awaiting };
+        let awaiting = names(stop.saved().awaiting.iter());
+        robot.known = Known { facts: facts_of(&stop.saved().latch), awaiting };
         (robot.told, robot.stage) = (stop.is_told(), stage);
         robot.moves = obeyed.level < StopLevel::Halt;
-        robot.stood |= awaiting | self.over(at, effective_of(&stop.kept().latch));
+        robot.stood |= awaiting | self.over(at, effective_of(&stop.saved().latch));
     }
 
     /// Resets that a side takes over.

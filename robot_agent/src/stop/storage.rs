@@ -1,4 +1,4 @@
-//! Keeps what must not be forgotten of stops, in a file of its own beside the ledger, or in memory.
+//! Saves the stops of a robot, in a file of its own beside the ledger, or in memory.
 //!
 //! Invariant: what cannot be read is not taken for nothing: the robot stands until a person resumes it by a name made
 //! for that, and the broken file stays beside the new one. One writer, newest value wins. Called by the shell of the
@@ -6,7 +6,7 @@
 
 use async_trait::async_trait;
 use midshift_core::ids::{RobotId, StopId};
-use midshift_core::stop::robot::Kept;
+use midshift_core::stop::robot::SavedStops;
 use midshift_core::time::Utc;
 use midshift_latch::LatchFile;
 use std::path::{Path, PathBuf};
@@ -22,56 +22,56 @@ const ROOM: usize = 512 * 1024;
 #[error("keeping stops: {0}")]
 pub struct Error(pub String);
 
-/// What was there at a start.
+/// The saved stops that an agent finds at its start.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Loaded {
-    /// What is known.
-    pub kept: Kept,
+    /// The stops.
+    pub saved: SavedStops,
     /// It survives the end of the process as it is. False: it is written as soon as that can be done.
     pub is_durable: bool,
 }
 
-/// Keeps the stops of one robot.
+/// Saves and loads the stops of one robot.
 #[async_trait]
-pub trait KeepStops: Send {
-    /// What was kept. If something was and cannot be read: `unreadable`.
-    async fn load(&mut self, unreadable: Kept) -> Loaded;
-    /// Keeps this instead of all before. Durable when it returns.
-    async fn save(&mut self, kept: Kept) -> Result<(), Error>;
+pub trait StopStorage: Send {
+    /// Loads what was saved last. If that cannot be read: `unreadable`.
+    async fn load(&mut self, unreadable: SavedStops) -> Loaded;
+    /// Saves these stops instead of all before. They are durable when it returns.
+    async fn save(&mut self, saved: SavedStops) -> Result<(), Error>;
 }
 
-/// What a robot begins with that cannot read what it kept: it stands, and a person resumes it by this name.
-pub fn unreadable(robot_id: &RobotId, wall: Utc) -> Kept {
+/// The stops of a robot that cannot read its saved ones: it stands, and a person resumes it by this name.
+pub fn unreadable(robot_id: &RobotId, wall: Utc) -> SavedStops {
     let named = StopId::parse(&format!("LATCH-{robot_id}-{}", wall.0));
-    Kept { awaiting: named.into_iter().collect(), ..Kept::default() }
+    SavedStops { awaiting: named.into_iter().collect(), ..SavedStops::default() }
 }
 
-/// In memory, for swarms: a handle; clones share what is kept.
+/// Saves stops in memory, for swarms: a handle whose clones share them.
 #[derive(Clone, Debug, Default)]
-pub struct MemoryStops(Arc<Mutex<Kept>>);
+pub struct MemoryStops(Arc<Mutex<SavedStops>>);
 
 impl MemoryStops {
-    fn lock(&self) -> MutexGuard<'_, Kept> {
+    fn lock(&self) -> MutexGuard<'_, SavedStops> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
-    /// What is kept.
-    pub fn kept(&self) -> Kept {
+    /// The stops that were saved last.
+    pub fn saved(&self) -> SavedStops {
         self.lock().clone()
     }
 }
 
 #[async_trait]
-impl KeepStops for MemoryStops {
-    async fn load(&mut self, _unreadable: Kept) -> Loaded {
-        Loaded { kept: self.kept(), is_durable: true }
+impl StopStorage for MemoryStops {
+    async fn load(&mut self, _unreadable: SavedStops) -> Loaded {
+        Loaded { saved: self.saved(), is_durable: true }
     }
-    async fn save(&mut self, kept: Kept) -> Result<(), Error> {
-        *self.lock() = kept;
+    async fn save(&mut self, saved: SavedStops) -> Result<(), Error> {
+        *self.lock() = saved;
         Ok(())
     }
 }
 
-/// In a file.
+/// Saves stops in a file.
 #[derive(Debug)]
 pub struct FileStops(Arc<Mutex<OnDisk>>);
 
@@ -96,38 +96,38 @@ impl FileStops {
 }
 
 #[async_trait]
-impl KeepStops for FileStops {
-    async fn load(&mut self, unreadable: Kept) -> Loaded {
+impl StopStorage for FileStops {
+    async fn load(&mut self, unreadable: SavedStops) -> Loaded {
         self.on_disk(move |disk| disk.load(unreadable)).await
     }
-    async fn save(&mut self, kept: Kept) -> Result<(), Error> {
-        self.on_disk(move |disk| disk.save(&kept)).await
+    async fn save(&mut self, saved: SavedStops) -> Result<(), Error> {
+        self.on_disk(move |disk| disk.save(&saved)).await
     }
 }
 
 impl OnDisk {
-    fn load(&mut self, unreadable: Kept) -> Loaded {
-        match self.open(&Kept::default()) {
-            Ok(kept) => Loaded { kept, is_durable: true },
+    fn load(&mut self, unreadable: SavedStops) -> Loaded {
+        match self.open(&SavedStops::default()) {
+            Ok(saved) => Loaded { saved, is_durable: true },
             Err(error) => {
                 tracing::error!(path = %self.path.display(), %error, "stops cannot be read: the robot stands until a person resumes it");
                 let is_broken =
                     matches!(error, midshift_latch::Error::Unreadable { .. } | midshift_latch::Error::Foreign { .. });
                 let is_durable = is_broken && self.replace(&unreadable).is_ok_and(|()| self.open(&unreadable).is_ok());
-                Loaded { kept: unreadable, is_durable }
+                Loaded { saved: unreadable, is_durable }
             }
         }
     }
 
-    fn open(&mut self, first: &Kept) -> Result<Kept, midshift_latch::Error> {
-        let (file, kept) = LatchFile::open(&self.path, ROOM, first.clone())?;
+    fn open(&mut self, first: &SavedStops) -> Result<SavedStops, midshift_latch::Error> {
+        let (file, saved) = LatchFile::open(&self.path, ROOM, first.clone())?;
         self.file = Some(file);
-        Ok(kept)
+        Ok(saved)
     }
 
     /// Puts a new file with `first` in place of a broken one, which is copied beside. A power cut leaves the broken one
     /// or the new one.
-    fn replace(&self, first: &Kept) -> Result<(), Error> {
+    fn replace(&self, first: &SavedStops) -> Result<(), Error> {
         let failed = |error: &dyn std::fmt::Display| Error(error.to_string());
         let beside = |ending: &str| self.path.with_extension(format!("latch.{ending}"));
         let (broken, new) = (beside("broken"), beside("new"));
@@ -142,15 +142,15 @@ impl OnDisk {
         midshift_durable::rename(&new, &self.path).map_err(|e| failed(&e))
     }
 
-    fn save(&mut self, kept: &Kept) -> Result<(), Error> {
+    fn save(&mut self, saved: &SavedStops) -> Result<(), Error> {
         if self.file.is_none() {
             // It could not be opened at the start; what lies there counts for nothing beside what is known since.
-            self.open(kept).map_err(|e| Error(e.to_string()))?;
+            self.open(saved).map_err(|e| Error(e.to_string()))?;
         }
         let Some(file) = &mut self.file else { return Err(Error("the file is not open".to_owned())) };
-        match file.write(kept) {
+        match file.write(saved) {
             // What was reset needs no room: told once more, it is effective until its reset is told once more.
-            Err(midshift_latch::Error::TooLarge { .. }) => file.write(&effective(kept)),
+            Err(midshift_latch::Error::TooLarge { .. }) => file.write(&effective(saved)),
             done => done,
         }
         .map_err(|e| Error(e.to_string()))
@@ -158,10 +158,10 @@ impl OnDisk {
 }
 
 /// Without what was reset.
-fn effective(kept: &Kept) -> Kept {
+fn effective(saved: &SavedStops) -> SavedStops {
     let mut latch = midshift_core::stop::Latch::default();
-    kept.latch.effective().cloned().for_each(|stop| {
+    saved.latch.effective().cloned().for_each(|stop| {
         latch.engage(stop);
     });
-    Kept { latch, ..kept.clone() }
+    SavedStops { latch, ..saved.clone() }
 }

@@ -1,17 +1,17 @@
-//! What a robot that has a stop line knows of stops, and when it must say something. Without IO.
+//! Holds what a robot with a stop line knows of stops, and decides when it must check in. Without IO.
 //!
 //! Invariant: a stop is obeyed before it is written or answered; one that cannot be written is obeyed all the same and
 //! said to be not durable. Nothing of the link, of bulk or of the ledger is on its path; what the link says of stops is
 //! added to it.
 
-use super::keep::Loaded;
 use super::messages::{CheckIn, StopNews, StopOrder};
+use super::storage::Loaded;
 use midshift_bundle::keys::PublicKey;
 use midshift_core::ids::{AreaId, RobotId, StopId, WaypointId};
 use midshift_core::limits;
 use midshift_core::robot::{Pose, StopLevel};
 use midshift_core::stop::ladder::{Around, Stage};
-use midshift_core::stop::robot::{Kept, Obeyed, RobotStop};
+use midshift_core::stop::robot::{Obeyed, RobotStop, SavedStops};
 use midshift_core::stop::{Latch, Reset};
 use midshift_core::time::{LinkDuration, LinkTime, Now, SiteTime};
 use midshift_proto::convert::stop::signed_reset;
@@ -48,9 +48,9 @@ pub(crate) struct Floor {
     pub(crate) areas: Vec<AreaId>,
 }
 
-/// What a robot that has a stop line knows of stops.
+/// The stops that a robot with a stop line knows, and how far the stop service and the file have them.
 #[derive(Debug)]
-pub(crate) struct Stops {
+pub(crate) struct StopState {
     robot: RobotStop,
     pub(crate) obeyed: Obeyed,
     pub(crate) around: Around,
@@ -73,11 +73,11 @@ pub(crate) struct Stops {
     write_at: LinkTime,
 }
 
-impl Stops {
-    /// A robot that begins with what it has kept.
+impl StopState {
+    /// A robot that begins with the stops that it loaded.
     pub(crate) fn begin(robot_id: RobotId, loaded: Loaded, now: LinkTime) -> Self {
         let mut stops = Self {
-            robot: RobotStop::begin(robot_id, loaded.kept, now),
+            robot: RobotStop::begin(robot_id, loaded.saved, now),
             obeyed: Obeyed { level: StopLevel::Halt, stage: Stage::Stand, ..Obeyed::default() },
             around: Around::People,
             bodily: StopLevel::None,
@@ -96,9 +96,9 @@ impl Stops {
         stops
     }
 
-    /// What must survive.
-    pub(crate) fn kept(&self) -> &Kept {
-        self.robot.kept()
+    /// The stops that must be saved.
+    pub(crate) fn saved(&self) -> &SavedStops {
+        self.robot.saved()
     }
 
     /// What waits for a person, at most [`limits::STOPS_MAX`].
@@ -172,7 +172,7 @@ impl Stops {
                 fed.into_iter().for_each(|sent| self.robot.answered(sent));
             }
             StopNews::LineLost => self.line = None,
-            StopNews::Kept { number, is_durable } => {
+            StopNews::Saved { number, is_durable } => {
                 self.writing = None;
                 if is_durable {
                     self.durable = self.durable.max(number);
@@ -186,7 +186,7 @@ impl Stops {
     /// Adds what the link brings of stops: the second way, for one whose own line is cut. It feeds no ladder and ends
     /// no wait for the first words on that line.
     pub(crate) fn take_link_facts(&mut self, facts: StopFacts) {
-        let key = self.kept().key.clone();
+        let key = self.saved().key.clone();
         let is_changed = self.robot.merge_relayed(facts.stops, facts.resets, |reset| is_marked(&key, reset));
         self.changed(is_changed);
     }
@@ -196,7 +196,7 @@ impl Stops {
         let mut orders = Vec::new();
         if self.writing.is_none() && self.changes > self.durable && now >= self.write_at {
             self.writing = Some(self.changes);
-            orders.push(StopOrder::Keep(self.changes, Box::new(self.kept().clone())));
+            orders.push(StopOrder::Save(self.changes, Box::new(self.saved().clone())));
         }
         let check_in = self.check_in(is_still);
         let Some(line) = &mut self.line else { return orders };
