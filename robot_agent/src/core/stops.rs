@@ -29,7 +29,7 @@ impl AgentCore {
     }
 
     /// Stops that it keeps and that are effective as far as it knows: what it says first on a line.
-    pub fn kept_stops(&self) -> impl Iterator<Item = &midshift_core::stop::Stop> {
+    pub fn known_stops(&self) -> impl Iterator<Item = &midshift_core::stop::Stop> {
         self.stop.iter().flat_map(|stop| stop.saved().latch.effective())
     }
 
@@ -56,7 +56,7 @@ impl AgentCore {
             && self.config.bugs.reset_clears_all()
             && let Some(reset) = resets.first().cloned()
         {
-            let known = self.kept_stops().map(|stop| stop.stop_id.clone());
+            let known = self.known_stops().map(|stop| stop.stop_id.clone());
             resets.extend(known.map(|stop_id| Reset { stop_id, ..reset.clone() }));
         }
         if let Some(stop) = &mut self.stop {

@@ -11,7 +11,7 @@ use crate::body::Body;
 use crate::bugs::Bugs;
 use crate::core::{AgentCore, CoreConfig, ExitReason, Input, Output};
 use crate::sets::Holdings;
-use crate::stop::line::{Line, Said, StopLine};
+use crate::stop::line::{Line, LineEvent, StopLine};
 use crate::stop::storage::unreadable;
 use crate::stop::{CheckIn, StopNews};
 use crate::storage::DeviceKey;
@@ -124,7 +124,7 @@ enum Woken {
     DialNow,
     Greeted(Greeted),
     Down(Option<Box<v1::SessionResponse>>),
-    Stop(Said),
+    Stop(LineEvent),
 }
 
 /// One agent.
@@ -260,7 +260,7 @@ impl Agent {
                 Woken::Channel(Err(why)) => self.failed(&why),
                 Woken::Greeted(greeted) => self.greeted(greeted),
                 Woken::Down(message) => self.heard(message),
-                Woken::Stop(said) => self.hear_stop(said),
+                Woken::Stop(event) => self.handle_line_event(event),
             }
         }
     }
@@ -280,7 +280,7 @@ impl Agent {
         let Self { committing, working, replaying, way, open, stop, .. } = self;
         tokio::select! {
             biased;
-            said = stopping(stop) => Woken::Stop(said),
+            event = stopping(stop) => Woken::Stop(event),
             (store, done) = ready(committing) => { *committing = None; Woken::Committed(store, done) }
             () = shutdown.cancelled() => Woken::Shutdown,
             (worker, done) = ready(working) => { *working = None; Woken::Worked(worker, Box::new(done)) }
@@ -349,12 +349,12 @@ impl Agent {
         }
     }
 
-    fn hear_stop(&mut self, said: Said) {
+    fn handle_line_event(&mut self, event: LineEvent) {
         let Some(line) = &mut self.stop else { return };
-        if matches!(said, Said::DialNow) {
-            return line.dial_now(&self.config.robot_id, &self.config.boot_id, self.core.kept_stops());
+        if matches!(event, LineEvent::DialNow) {
+            return line.dial_now(&self.config.robot_id, &self.config.boot_id, self.core.known_stops());
         }
-        if let Some(news) = line.take_in(&self.config.robot_id, said) {
+        if let Some(news) = line.take_in(&self.config.robot_id, event) {
             self.step(Input::Stop(Box::new(news)));
         }
     }
@@ -547,7 +547,7 @@ async fn ready<T>(future: &mut Option<Boxed<'static, T>>) -> T {
     }
 }
 
-async fn stopping(line: &mut Option<Line>) -> Said {
+async fn stopping(line: &mut Option<Line>) -> LineEvent {
     match line {
         Some(line) => line.next().await,
         None => pending().await,

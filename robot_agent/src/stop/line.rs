@@ -94,8 +94,8 @@ enum Way {
     Dialing(Boxed<'static, Result<Open, NoLine>>),
 }
 
-/// What the line brings.
-pub(crate) enum Said {
+/// An event of the stop line.
+pub(crate) enum LineEvent {
     /// It is time to dial.
     DialNow,
     /// What came of it.
@@ -141,13 +141,13 @@ impl Line {
     }
 
     /// What it brings next. May be dropped and called again at any time.
-    pub(crate) async fn next(&mut self) -> Said {
+    pub(crate) async fn next(&mut self) -> LineEvent {
         let Self { open, way, saving, .. } = self;
         tokio::select! {
             biased;
-            message = heard(open) => Said::Heard(message.map(Box::new)),
+            message = heard(open) => LineEvent::Heard(message.map(Box::new)),
             said = progress(way) => { *way = Way::Idle; said }
-            (storage, number, done) = written(saving) => { *saving = None; Said::Saved(storage, number, done) }
+            (storage, number, done) = written(saving) => { *saving = None; LineEvent::Saved(storage, number, done) }
         }
     }
 
@@ -161,17 +161,17 @@ impl Line {
         }));
     }
 
-    /// What of it the core must hear.
-    pub(crate) fn take_in(&mut self, robot_id: &RobotId, said: Said) -> Option<StopNews> {
-        match said {
-            Said::DialNow => None,
-            Said::Dialed(Ok(open)) => {
+    /// Handles an event, and returns the news that the core must hear of it.
+    pub(crate) fn take_in(&mut self, robot_id: &RobotId, event: LineEvent) -> Option<StopNews> {
+        match event {
+            LineEvent::DialNow => None,
+            LineEvent::Dialed(Ok(open)) => {
                 tracing::info!(%robot_id, "stop line open");
                 self.open = Some(open);
                 // A number that was never used before, in any life of this robot.
                 Some(StopNews::Attended { nonce: self.rng.random::<u64>() ^ rand::random::<u64>() })
             }
-            Said::Dialed(Err(NoLine { why, again_after, is_revoked })) => {
+            LineEvent::Dialed(Err(NoLine { why, again_after, is_revoked })) => {
                 self.log_refusal(robot_id, &why);
                 if is_revoked {
                     self.wait(limits::REVOKED_RETRY.as_ms());
@@ -180,11 +180,9 @@ impl Line {
                 }
                 None
             }
-            Said::Heard(None) => self.lost("the line ended"),
-            Said::Heard(Some(message)) => match parse(*message) {
-                Ok(FromStop::Facts { stops, resets, generation }) => {
-                    Some(StopNews::Facts { stops, resets, generation })
-                }
+            LineEvent::Heard(None) => self.lost("the line ended"),
+            LineEvent::Heard(Some(message)) => match parse(*message) {
+                Ok(FromStop::Told { stops, resets, generation }) => Some(StopNews::Told { stops, resets, generation }),
                 Ok(FromStop::Synced { generation, key }) => {
                     self.failures = 0;
                     self.refused.forget();
@@ -205,7 +203,7 @@ impl Line {
                     self.lost("a message cannot be read")
                 }
             },
-            Said::Saved(storage, number, done) => {
+            LineEvent::Saved(storage, number, done) => {
                 self.storage = Some(storage);
                 if let Err(error) = &done {
                     tracing::error!(%robot_id, %error, "stops not kept: they are obeyed all the same");
@@ -337,14 +335,14 @@ async fn heard(open: &mut Option<Open>) -> Option<v1::AttendResponse> {
     }
 }
 
-async fn progress(way: &mut Way) -> Said {
+async fn progress(way: &mut Way) -> LineEvent {
     match way {
         Way::Idle => pending().await,
         Way::Waiting(sleep) => {
             sleep.await;
-            Said::DialNow
+            LineEvent::DialNow
         }
-        Way::Dialing(dialing) => Said::Dialed(dialing.await),
+        Way::Dialing(dialing) => LineEvent::Dialed(dialing.await),
     }
 }
 

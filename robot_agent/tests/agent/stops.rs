@@ -319,7 +319,7 @@ fn an_action_that_may_not_be_paused_stands_too_and_goes_on_by_permission_only() 
 #[test]
 fn what_stood_it_stands_it_again_after_it_was_killed() {
     let mut rig = halted().restart();
-    assert_eq!((level(&rig), rig.core.kept_stops().count()), (StopLevel::Halt, 1));
+    assert_eq!((level(&rig), rig.core.known_stops().count()), (StopLevel::Halt, 1));
     // A stop service that has forgotten it.
     rig.connect();
     attend(&mut rig);

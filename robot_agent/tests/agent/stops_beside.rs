@@ -35,7 +35,7 @@ fn halted() -> Rig {
 }
 
 fn is_stopped(rig: &Rig) -> bool {
-    level(rig) == StopLevel::Halt && rig.core.kept_stops().any(|stop| stop.stop_id == stop_id(1))
+    level(rig) == StopLevel::Halt && rig.core.known_stops().any(|stop| stop.stop_id == stop_id(1))
 }
 
 #[test]
@@ -45,7 +45,7 @@ fn a_stop_that_is_heard_on_the_link_alone_is_obeyed_kept_and_brought_back() {
     assert_eq!(awaiting(&rig), ["STOP-1"]);
     assert!(rig.stop.saved.latch.is_effective(&stop_id(1)), "it is in the file");
     let rig = rig.restart();
-    assert_eq!(rig.core.kept_stops().map(|stop| stop.stop_id.clone()).collect::<Vec<_>>(), [stop_id(1)]);
+    assert_eq!(rig.core.known_stops().map(|stop| stop.stop_id.clone()).collect::<Vec<_>>(), [stop_id(1)]);
     assert_eq!(awaiting(&freed_of_silence(rig)), ["STOP-1"]);
 }
 
@@ -83,9 +83,9 @@ fn a_reset_on_the_link_counts_by_the_mark_of_the_stop_service_alone() {
         assert!(is_stopped(&rig), "freed by {refused:?}");
     }
     says(&mut rig, vec![], vec![marked(reset(1), &service())]);
-    assert_eq!((rig.core.kept_stops().count(), awaiting(&rig)), (0, vec!["STOP-1".to_owned()]), "a person resumes it");
+    assert_eq!((rig.core.known_stops().count(), awaiting(&rig)), (0, vec!["STOP-1".to_owned()]), "a person resumes it");
     says(&mut rig, vec![stop(1, StopLevel::Halt)], vec![]);
-    assert_eq!(rig.core.kept_stops().count(), 0, "what was reset stays so, whatever is heard late");
+    assert_eq!(rig.core.known_stops().count(), 0, "what was reset stays so, whatever is heard late");
 }
 
 #[test]
@@ -95,8 +95,8 @@ fn before_the_stop_service_has_said_its_key_no_reset_on_the_link_counts() {
     says(&mut rig, vec![], vec![marked(reset(1), &service())]);
     assert!(is_stopped(&rig));
     // On its own line it needs no mark.
-    hear_news(&mut rig, StopNews::Facts { stops: vec![], resets: vec![reset(1)], generation: 11 });
-    assert_eq!(rig.core.kept_stops().count(), 0);
+    hear_news(&mut rig, StopNews::Told { stops: vec![], resets: vec![reset(1)], generation: 11 });
+    assert_eq!(rig.core.known_stops().count(), 0);
 }
 
 #[test]
@@ -113,5 +113,5 @@ fn a_list_beyond_its_limit_is_refused_by_itself_and_what_is_latched_stays() {
     assert!(down.echo.is_some() && down.stops.is_none() && why.contains("resets"), "{why}");
     rig.down(*down);
     assert!(is_stopped(&rig));
-    assert_eq!(rig.core.kept_stops().count(), 1, "nothing of it was taken");
+    assert_eq!(rig.core.known_stops().count(), 1, "nothing of it was taken");
 }
