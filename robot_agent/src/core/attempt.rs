@@ -427,7 +427,7 @@ impl AgentCore {
             _ => None,
         };
         let area = work.order.as_ref().and_then(|o| o.route.last()).map(|p| &p.area_id);
-        let policy = area.and_then(|a| governor::policy_of(&self.kept.ledger.policy, a));
+        let policy = area.and_then(|a| governor::policy_of(&self.memory.ledger.policy, a));
         let stop = asked.unwrap_or(u64::from(policy.map_or(CHARGE_STOP_PERMILLE, |p| p.charge_stop_permille)));
         if u64::from(self.body.state(now.site).battery_permille) < stop.min(1000) {
             return false;
@@ -511,7 +511,7 @@ impl AgentCore {
 
     pub(crate) fn reported_attempts(&self, now: &Now) -> Vec<ReportedAttempt> {
         let live = self.work.as_ref().map(|w| self.listed(w, self.work_state(self.pause(now))));
-        live.into_iter().chain(self.kept.ledger.unclosed.values().cloned()).collect()
+        live.into_iter().chain(self.memory.ledger.unclosed.values().cloned()).collect()
     }
 
     fn report_of(&self, work: &Work, state: WorkState, now: &Now) -> AttemptReport {

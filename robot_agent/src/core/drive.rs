@@ -89,7 +89,7 @@ impl AgentCore {
     }
 
     fn path(&self, order: &Assignment, next: usize, limit: usize) -> Vec<PathPoint> {
-        let (policy, stop) = (&self.kept.ledger.policy, self.stop_level());
+        let (policy, stop) = (&self.memory.ledger.policy, self.stop_level());
         let point = |p: &RoutePoint| PathPoint {
             waypoint: p.waypoint.clone(),
             x_mm: p.x_mm,

@@ -14,8 +14,8 @@ impl AgentCore {
     /// What it has installed, signed for this start of the agent. None: its software is not changed, or its sets were
     /// never seen.
     pub fn installed(&self, boot_id: &str) -> Option<String> {
-        let (holdings, key) = (self.holdings()?, self.kept().ledger.device.as_ref()?);
-        let staged = self.kept().ledger.software.update.as_ref().and_then(|u| u.set.as_ref()).map(|set| set.id());
+        let (holdings, key) = (self.holdings()?, self.memory().ledger.device.as_ref()?);
+        let staged = self.memory().ledger.software.update.as_ref().and_then(|u| u.set.as_ref()).map(|set| set.id());
         let id = |name: &str| SetId::parse(name).ok();
         let switch = &holdings.switch;
         let installed = Installed {

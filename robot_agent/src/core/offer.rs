@@ -24,7 +24,7 @@ const UNREADABLE_DETAIL_CHARS: usize = 200;
 impl AgentCore {
     /// Obeys section work.
     pub(crate) fn on_work(&mut self, now: &Now, desired: DesiredWork) {
-        let mut applied = self.kept.ledger.applied;
+        let mut applied = self.memory.ledger.applied;
         if desired.generation < applied.work {
             tracing::warn!(generation = desired.generation, applied = applied.work, "older work refused");
             return;
@@ -33,7 +33,7 @@ impl AgentCore {
         self.work_unreadable = false;
         self.write(Op::Applied(applied), false);
         for attempt in &desired.closed {
-            if self.kept.ledger.unclosed.contains_key(attempt) {
+            if self.memory.ledger.unclosed.contains_key(attempt) {
                 self.write(Op::Closed(attempt.clone()), false);
             }
         }
@@ -78,7 +78,7 @@ impl AgentCore {
     /// The drain that holds the robot goes onto the ledger only when no attempt does.
     fn mind_maintenance(&mut self, drain_id: Option<DrainId>) {
         let taken = drain_id.filter(|_| self.work.is_none());
-        if taken != self.kept.ledger.maintenance {
+        if taken != self.memory.ledger.maintenance {
             self.write(Op::Maintenance(taken), true);
         }
     }
@@ -160,8 +160,8 @@ impl AgentCore {
         if fenced && (self.refused.contains(&attempt) || self.answer_from_ledger(&assignment)) {
             return;
         }
-        if fenced && self.kept.ledger.highest_epoch(&attempt.subject) >= attempt.epoch {
-            let passed = self.kept.ledger.highest_epoch(&attempt.subject);
+        if fenced && self.memory.ledger.highest_epoch(&attempt.subject) >= attempt.epoch {
+            let passed = self.memory.ledger.highest_epoch(&attempt.subject);
             return self.refuse(now, &assignment, Reason::from(Code::StaleEpoch).with("passed", passed));
         }
         if assignment.stop {
@@ -180,7 +180,7 @@ impl AgentCore {
         if self.is_stopped() {
             return self.refuse(now, &assignment, Reason::from(Code::RobotStopped).with("by", "fleet stop"));
         }
-        if self.kept.ledger.maintenance.is_some() || self.changes_software() {
+        if self.memory.ledger.maintenance.is_some() || self.changes_software() {
             return self.refuse(now, &assignment, Code::InMaintenance.into());
         }
         if let Some(reason) = self.software_refusal() {
@@ -207,12 +207,12 @@ impl AgentCore {
     /// What ended here is answered from memory, once in a process. True: answered or already said.
     fn answer_from_ledger(&mut self, assignment: &Assignment) -> bool {
         let attempt = &assignment.attempt;
-        let Some(report) = self.kept.ledger.ended(&attempt.subject).cloned() else { return false };
+        let Some(report) = self.memory.ledger.ended(&attempt.subject).cloned() else { return false };
         let same = report.attempt == *attempt;
         if !same && report.state != WorkState::Succeeded {
             return false;
         }
-        let listed = self.kept.ledger.unclosed.contains_key(attempt);
+        let listed = self.memory.ledger.unclosed.contains_key(attempt);
         if !(same && listed) && self.answered.insert(attempt.clone()) {
             self.emit(Lane::Event, RobotEvent::Attempt(AttemptReport::clone(&report)));
             if !same {

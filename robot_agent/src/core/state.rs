@@ -10,7 +10,7 @@ use super::throttle::Throttle;
 use super::work::{Doing, Work};
 use crate::body::{Body, BodyLimits};
 use crate::stop::StopState;
-use crate::storage::{Kept, Op};
+use crate::storage::{Op, RobotMemory};
 use crate::transport::replay::Pace;
 use crate::update::Updater;
 use midshift_core::authority::SentHeartbeats;
@@ -65,7 +65,7 @@ pub struct AgentCore {
     pub(crate) body: Box<dyn Body>,
     pub(crate) limits: BodyLimits,
     pub(crate) inventory: Inventory,
-    pub(crate) kept: Kept,
+    pub(crate) memory: RobotMemory,
     pub(crate) places: Places,
     pub(crate) work: Option<Work>,
     pub(crate) desired: Option<DesiredWork>,
@@ -110,10 +110,10 @@ pub struct AgentCore {
 }
 
 impl AgentCore {
-    /// A robot that remembers `kept`. Call with [`super::Input::Start`] first.
-    pub fn new(config: CoreConfig, body: Box<dyn Body>, kept: Kept, now: Now) -> Self {
+    /// A robot that begins with `memory`. Call with [`super::Input::Start`] first.
+    pub fn new(config: CoreConfig, body: Box<dyn Body>, memory: RobotMemory, now: Now) -> Self {
         let bugs = config.bugs;
-        let (places, restored) = Places::restored(kept.ledger.places.clone(), bugs.grant_from_receipt());
+        let (places, restored) = Places::restored(memory.ledger.places.clone(), bugs.grant_from_receipt());
         let mut throttle = Throttle::new(now.link);
         restored.into_iter().for_each(|event| throttle.push(Lane::Event, event));
         Self {
@@ -121,12 +121,12 @@ impl AgentCore {
             inventory: body.capabilities(),
             mode: body.mode(),
             hardware_stop: body.hardware_stop(),
-            work: kept.ledger.holder.clone().map(Work::restored),
-            sender: Sender::new(&kept.ring),
+            work: memory.ledger.holder.clone().map(Work::restored),
+            sender: Sender::new(&memory.ring),
             update: Updater { config: config.update.clone(), ..Updater::default() },
             config,
             body,
-            kept,
+            memory,
             places,
             throttle,
             desired: None,
@@ -162,9 +162,9 @@ impl AgentCore {
         }
     }
 
-    /// What it remembers.
-    pub fn kept(&self) -> &Kept {
-        &self.kept
+    /// The robot's memory, as it is applied and perhaps not yet durable.
+    pub fn memory(&self) -> &RobotMemory {
+        &self.memory
     }
 
     /// The robot that the agent is of.
@@ -198,7 +198,7 @@ impl AgentCore {
 
     /// Applies an operation and queues it for the store. Not urgent: it may wait for the next second's group.
     pub(crate) fn write(&mut self, op: Op, urgent: bool) {
-        self.kept.apply(&op);
+        self.memory.apply(&op);
         self.writes.ops.push(op);
         self.writes.given += 1;
         self.writes.urgent |= urgent;
@@ -226,7 +226,7 @@ impl AgentCore {
 
     /// Writes places down if they changed.
     pub(crate) fn write_places(&mut self) {
-        if self.places.row != self.kept.ledger.places {
+        if self.places.row != self.memory.ledger.places {
             self.write(Op::Places(self.places.row.clone()), true);
         }
     }

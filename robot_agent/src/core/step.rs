@@ -90,10 +90,10 @@ impl AgentCore {
         ReportedState {
             hb: session.map_or(0, |s| s.hb),
             session_epoch: session.map_or(0, |s| s.epoch),
-            applied_work: self.kept.ledger.applied.work,
-            applied_policy: self.kept.ledger.applied.policy,
-            applied_update: self.kept.ledger.applied.update,
-            produced: Lane::ALL.into_iter().map(|lane| (lane, self.kept.ring.lane(lane).produced)).collect(),
+            applied_work: self.memory.ledger.applied.work,
+            applied_policy: self.memory.ledger.applied.policy,
+            applied_update: self.memory.ledger.applied.update,
+            produced: Lane::ALL.into_iter().map(|lane| (lane, self.memory.ring.lane(lane).produced)).collect(),
             mode: self.mode,
             vitals: self.vitals(now),
             load: self.body.load(),
@@ -165,7 +165,7 @@ impl AgentCore {
             told_room: None,
         });
         self.listed_load.clear();
-        let old = &self.kept.ledger.session;
+        let old = &self.memory.ledger.session;
         if old.store_id != welcome.store_id {
             self.answered.clear();
             if !old.store_id.is_empty() {
@@ -179,13 +179,13 @@ impl AgentCore {
         };
         self.write(Op::Session(memory), true);
         for ack in &welcome.acks {
-            for op in self.kept.ring.jump(ack.lane, ack.seq) {
+            for op in self.memory.ring.jump(ack.lane, ack.seq) {
                 tracing::error!(lane = ack.lane.as_str(), watermark = ack.seq, "ring behind server, numbers moved on");
                 self.write(op, true);
             }
         }
         welcome.acks.iter().for_each(|ack| self.acked(ack));
-        self.sender.connected(&self.kept.ring, welcome.status_credit_bytes as usize);
+        self.sender.connected(&self.memory.ring, welcome.status_credit_bytes as usize);
         self.pace = Pace::default();
         if welcome.observed {
             // Nothing of it is stored, whichever way it goes.
@@ -234,12 +234,12 @@ impl AgentCore {
     }
 
     fn on_policy(&mut self, policy: DesiredPolicy) {
-        let mut applied = self.kept.ledger.applied;
+        let mut applied = self.memory.ledger.applied;
         if policy.generation < applied.policy {
             tracing::warn!(generation = policy.generation, applied = applied.policy, "older policy refused");
             return;
         }
-        if policy.areas != self.kept.ledger.policy {
+        if policy.areas != self.memory.ledger.policy {
             self.write(Op::Policy(policy.areas), true);
         }
         applied.policy = policy.generation;
@@ -247,14 +247,14 @@ impl AgentCore {
     }
 
     fn acked(&mut self, ack: &LaneAck) {
-        if let Some(op) = self.kept.ring.ack(ack.lane, ack.seq) {
+        if let Some(op) = self.memory.ring.ack(ack.lane, ack.seq) {
             self.write(op, false);
         }
     }
 
     fn expected(&mut self, ack: &LaneAck) {
         let Some(expect) = ack.expect else { return };
-        if let Some(op) = self.kept.ring.expected(ack.lane, expect) {
+        if let Some(op) = self.memory.ring.expected(ack.lane, expect) {
             self.write(op, true);
         }
         self.sender.rewind(ack.lane, expect);
@@ -278,7 +278,7 @@ impl AgentCore {
             self.next_status = now.site + self.status_period;
             let vitals = self.vitals(now);
             self.check_battery(vitals.battery_permille);
-            for op in self.kept.ring.append(Lane::Status, now.wall.0, SampleBody::Status(vitals)) {
+            for op in self.memory.ring.append(Lane::Status, now.wall.0, SampleBody::Status(vitals)) {
                 self.write(op, false);
             }
         }
@@ -311,7 +311,7 @@ impl AgentCore {
     fn write_events(&mut self, now: &Now) {
         self.write_places();
         while let Some((lane, event)) = self.throttle.ready(now.link) {
-            for op in self.kept.ring.append(lane, now.wall.0, SampleBody::Event(event)) {
+            for op in self.memory.ring.append(lane, now.wall.0, SampleBody::Event(event)) {
                 self.write(op, true);
             }
         }
@@ -322,11 +322,11 @@ impl AgentCore {
         if self.writes.in_flight.is_some() || self.writes.ops.is_empty() || !due {
             return;
         }
-        let forget = self.kept.ledger.forgettable(now.wall.0);
+        let forget = self.memory.ledger.forgettable(now.wall.0);
         forget.into_iter().for_each(|op| self.write(op, false));
         self.writes.batch += 1;
         self.writes.urgent = false;
-        let lanes = Lane::ALL.map(|lane| self.kept.ring.lane(lane).produced);
+        let lanes = Lane::ALL.map(|lane| self.memory.ring.lane(lane).produced);
         self.writes.in_flight = Some((self.writes.batch, self.writes.given, lanes));
         out.push(Output::Persist(self.writes.batch, std::mem::take(&mut self.writes.ops)));
     }
@@ -353,7 +353,7 @@ impl AgentCore {
         if beat {
             message.heartbeat = self.heartbeat(now);
         }
-        let waiting = self.kept.ring.lane(Lane::Status).samples.len();
+        let waiting = self.memory.ring.lane(Lane::Status).samples.len();
         if beat || waiting > limits::SAMPLES_PER_MESSAGE / 8 {
             self.send_lane(Lane::Status, &mut message, out);
         }
@@ -365,7 +365,7 @@ impl AgentCore {
 
     fn send_lane(&mut self, lane: Lane, message: &mut Uplink, out: &mut Vec<Output>) {
         let size = |b: &LaneBatch| b.items.len();
-        while let Some(batch) = self.sender.next_batch(&self.kept.ring, lane) {
+        while let Some(batch) = self.sender.next_batch(&self.memory.ring, lane) {
             let have: usize = message.batches.iter().map(size).sum();
             if have + size(&batch) > limits::SAMPLES_PER_MESSAGE {
                 out.push(Output::Send(Box::new(std::mem::take(message))));
@@ -379,10 +379,10 @@ impl AgentCore {
         if self.session.is_none() || !self.pace.is_due(now.link) {
             return;
         }
-        let Some(batch) = self.sender.next_replay(&self.kept.ring) else { return };
+        let Some(batch) = self.sender.next_replay(&self.memory.ring) else { return };
         let cap_bytes_s = self.update.desired.as_ref().map_or(0, |d| d.rate_bytes_s);
         self.pace.sent(now.link, batch.items.len() * STATUS_SAMPLE_BYTES, cap_bytes_s);
-        let memory = &self.kept.ledger.session;
+        let memory = &self.memory.ledger.session;
         out.push(Output::Replay(Box::new(StatusReplay {
             robot_id: self.config.robot_id.clone(),
             session_epoch: memory.session_epoch,
@@ -397,16 +397,16 @@ impl AgentCore {
         if self.session.as_ref().is_none_or(|s| s.epoch != session_epoch) {
             return;
         }
-        let before = self.kept.ring.lane(Lane::Status).acked;
+        let before = self.memory.ring.lane(Lane::Status).acked;
         if let Replayed::Stored(ack) = &replayed {
             self.acked(ack);
         }
-        self.sender.replayed(&self.kept.ring);
+        self.sender.replayed(&self.memory.ring);
         if let Replayed::Stored(ack) = &replayed {
             self.expected(ack);
         }
         let goes_on = match &replayed {
-            Replayed::Stored(_) if self.kept.ring.lane(Lane::Status).acked > before => {
+            Replayed::Stored(_) if self.memory.ring.lane(Lane::Status).acked > before => {
                 self.pace.went_well();
                 true
             }

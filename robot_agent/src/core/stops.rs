@@ -247,7 +247,7 @@ impl AgentCore {
         {
             stop.floor = Floor::default();
         }
-        let policy = &self.kept.ledger.policy;
+        let policy = &self.memory.ledger.policy;
         let is_without = |area: &AreaId| governor::policy_of(policy, area).is_some_and(|p| p.without_people);
         match self.stop.as_ref().map(|stop| &stop.floor.areas) {
             Some(areas) if !areas.is_empty() && areas.iter().all(is_without) => Around::Robots,

@@ -164,11 +164,11 @@ pub fn run(
     shutdown: CancellationToken,
 ) -> Boxed<'static, Result<ExitReason, Error>> {
     Box::pin(async move {
-        let mut kept = store.load(&config.new_ring_id).await?;
-        if kept.ledger.device.is_none() {
+        let mut memory = store.load(&config.new_ring_id).await?;
+        if memory.ledger.device.is_none() {
             let made = Op::Device(DeviceKey::draw());
             store.commit(std::slice::from_ref(&made)).await?;
-            kept.apply(&made);
+            memory.apply(&made);
         }
         let holdings = look_at_disk(config.update.as_mut()).await;
         let core = CoreConfig {
@@ -177,7 +177,7 @@ pub fn run(
             update: config.update.as_ref().map(|u| u.config.clone()),
             server_is_proven: lines.link.proves_server(),
         };
-        let mut core = AgentCore::new(core, body, kept, clock.now());
+        let mut core = AgentCore::new(core, body, memory, clock.now());
         core.saw(holdings);
         let mut stop = None;
         if let Some(line) = config.stop.take() {
@@ -434,22 +434,22 @@ impl Agent {
     }
 
     fn hello(&self, now: &Now) -> Hello {
-        let kept = self.core.kept();
-        let memory = &kept.ledger.session;
+        let memory = self.core.memory();
+        let session = &memory.ledger.session;
         let position = |lane: Lane| {
-            let kept = kept.ring.lane(lane);
-            (lane, LanePosition { first_seq: kept.first(), next_seq: kept.produced + 1 })
+            let buffer = memory.ring.lane(lane);
+            (lane, LanePosition { first_seq: buffer.first(), next_seq: buffer.produced + 1 })
         };
         Hello {
             robot_id: self.config.robot_id.clone(),
             boot_id: self.config.boot_id.clone(),
-            previous: (memory.session_epoch > 0)
-                .then(|| Previous { session_epoch: memory.session_epoch, secret: memory.secret.clone() }),
+            previous: (session.session_epoch > 0)
+                .then(|| Previous { session_epoch: session.session_epoch, secret: session.secret.clone() }),
             inventory: self.core.inventory().clone(),
             reported: ReportedState { hb: 0, session_epoch: 0, ..self.core.reported(now) },
-            ring: kept.ring.id.clone(),
+            ring: memory.ring.id.clone(),
             lanes: Lane::ALL.into_iter().map(position).collect(),
-            store_id: memory.store_id.clone(),
+            store_id: session.store_id.clone(),
             sent_unix_ms: now.wall.0,
             clock_rate_permille: self.clock.rate_permille(),
             protocol_versions: vec![PROTOCOL_VERSION],

@@ -22,4 +22,4 @@ pub use proven::Proven;
 pub use ring::Ring;
 pub use rows::{Applied, Holder, Intent, PlacesRow, SessionMemory, SubjectRow};
 pub use software::{DueMigration, HeldKeys, SoftwareRow, Update};
-pub use store::{Kept, Store};
+pub use store::{RobotMemory, Store};

@@ -13,9 +13,9 @@ use midshift_core::work::{Gap, Sample, SampleBody};
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// What the ring keeps of one lane.
+/// The samples and gaps of one lane that the server has not acknowledged.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct LaneKept {
+pub struct LaneBuffer {
     /// Highest number ever given. 0: none.
     pub produced: u64,
     /// Everything up to here is stored by the server.
@@ -26,7 +26,7 @@ pub struct LaneKept {
     pub gaps: VecDeque<Gap>,
 }
 
-impl LaneKept {
+impl LaneBuffer {
     /// Oldest number that can still be sent, as sample or gap; the next number to be given if nothing is kept.
     pub fn first(&self) -> u64 {
         let sample = self.samples.front().map(|s| s.seq);
@@ -49,7 +49,7 @@ pub enum Item {
 pub struct Ring {
     /// Random, made when the ring was formatted.
     pub id: String,
-    lanes: [LaneKept; 3],
+    lanes: [LaneBuffer; 3],
 }
 
 /// Share of a full STATUS lane that is freed at once.
@@ -62,37 +62,37 @@ impl Ring {
     }
 
     /// One lane.
-    pub fn lane(&self, lane: Lane) -> &LaneKept {
+    pub fn lane(&self, lane: Lane) -> &LaneBuffer {
         &self.lanes[lane as usize]
     }
 
     /// One lane, for a store that reads it back.
-    pub fn lane_mut(&mut self, lane: Lane) -> &mut LaneKept {
+    pub fn lane_mut(&mut self, lane: Lane) -> &mut LaneBuffer {
         &mut self.lanes[lane as usize]
     }
 
     /// The operations that add one sample: room is made first if STATUS is full.
     pub fn append(&self, lane: Lane, robot_unix_ms: i64, body: SampleBody) -> Vec<Op> {
-        let kept = self.lane(lane);
+        let buffer = self.lane(lane);
         let mut ops = Vec::new();
-        if lane == Lane::Status && kept.samples.len() >= limits::RING_STATUS_MAX {
+        if lane == Lane::Status && buffer.samples.len() >= limits::RING_STATUS_MAX {
             let room = limits::RING_STATUS_MAX / THIN_BY;
-            if let (Some(first), Some(last)) = (kept.samples.front(), kept.samples.get(room - 1)) {
-                let before = kept.gaps.iter().find(|g| g.to_seq + 1 == first.seq).map(|g| g.from_seq);
+            if let (Some(first), Some(last)) = (buffer.samples.front(), buffer.samples.get(room - 1)) {
+                let before = buffer.gaps.iter().find(|g| g.to_seq + 1 == first.seq).map(|g| g.from_seq);
                 let from_seq = before.unwrap_or(first.seq);
                 ops.push(Op::Gap(Gap { lane, from_seq, to_seq: last.seq, reason: Code::Overflow.into() }));
             }
         }
-        let sample = Sample { seq: kept.produced + 1, robot_unix_ms, body };
+        let sample = Sample { seq: buffer.produced + 1, robot_unix_ms, body };
         ops.push(Op::Append(lane, Arc::new(sample)));
         ops
     }
 
     /// The operation that obeys an acknowledgement, if it says anything new.
     pub fn ack(&self, lane: Lane, seq: u64) -> Option<Op> {
-        let kept = self.lane(lane);
-        let seq = seq.min(kept.produced);
-        let news = seq > kept.acked || kept.gaps.front().is_some_and(|g| g.to_seq <= seq);
+        let buffer = self.lane(lane);
+        let seq = seq.min(buffer.produced);
+        let news = seq > buffer.acked || buffer.gaps.front().is_some_and(|g| g.to_seq <= seq);
         news.then_some(Op::Free(lane, seq))
     }
 
@@ -106,12 +106,12 @@ impl Ring {
     /// The operations that move a lane's numbers past `watermark`, which the server has from a later life of this ring:
     /// a disk that was put back. Samples with used numbers would be dropped as known.
     pub fn jump(&self, lane: Lane, watermark: u64) -> Vec<Op> {
-        let kept = self.lane(lane);
-        if watermark <= kept.produced {
+        let buffer = self.lane(lane);
+        if watermark <= buffer.produced {
             return Vec::new();
         }
         let mut ops = vec![Op::Jump(lane, watermark)];
-        for (at, sample) in kept.samples.iter().enumerate() {
+        for (at, sample) in buffer.samples.iter().enumerate() {
             let seq = watermark + 1 + at as u64;
             ops.push(Op::Append(lane, Arc::new(Sample { seq, ..Sample::clone(sample) })));
         }
@@ -120,40 +120,40 @@ impl Ring {
 
     /// What to send after number `cursor`. None: nothing yet.
     pub fn after(&self, lane: Lane, cursor: u64) -> Option<Item> {
-        let kept = self.lane(lane);
-        if let Some(gap) = kept.gaps.iter().find(|g| g.from_seq <= cursor + 1 && g.to_seq > cursor) {
+        let buffer = self.lane(lane);
+        if let Some(gap) = buffer.gaps.iter().find(|g| g.from_seq <= cursor + 1 && g.to_seq > cursor) {
             return Some(Item::Gap(gap.clone()));
         }
-        let at = kept.samples.partition_point(|s| s.seq <= cursor);
-        kept.samples.get(at).map(|s| Item::Sample(s.clone()))
+        let at = buffer.samples.partition_point(|s| s.seq <= cursor);
+        buffer.samples.get(at).map(|s| Item::Sample(s.clone()))
     }
 
     /// Applies one operation; others than those of the ring change nothing.
     pub fn apply(&mut self, op: &Op) {
         match op {
             Op::Append(lane, sample) => {
-                let kept = self.lane_mut(*lane);
-                kept.produced = sample.seq;
-                kept.samples.push_back(sample.clone());
+                let buffer = self.lane_mut(*lane);
+                buffer.produced = sample.seq;
+                buffer.samples.push_back(sample.clone());
             }
             Op::Free(lane, seq) => {
-                let kept = self.lane_mut(*lane);
-                kept.acked = kept.acked.max(*seq);
-                while kept.samples.front().is_some_and(|s| s.seq <= *seq) {
-                    kept.samples.pop_front();
+                let buffer = self.lane_mut(*lane);
+                buffer.acked = buffer.acked.max(*seq);
+                while buffer.samples.front().is_some_and(|s| s.seq <= *seq) {
+                    buffer.samples.pop_front();
                 }
-                kept.gaps.retain(|g| g.to_seq > *seq);
+                buffer.gaps.retain(|g| g.to_seq > *seq);
             }
             Op::Gap(gap) => {
-                let kept = self.lane_mut(gap.lane);
-                kept.samples.retain(|s| s.seq < gap.from_seq || s.seq > gap.to_seq);
-                kept.gaps.retain(|g| g.from_seq < gap.from_seq || g.to_seq > gap.to_seq);
-                let at = kept.gaps.partition_point(|g| g.from_seq < gap.from_seq);
-                kept.gaps.insert(at, gap.clone());
+                let buffer = self.lane_mut(gap.lane);
+                buffer.samples.retain(|s| s.seq < gap.from_seq || s.seq > gap.to_seq);
+                buffer.gaps.retain(|g| g.from_seq < gap.from_seq || g.to_seq > gap.to_seq);
+                let at = buffer.gaps.partition_point(|g| g.from_seq < gap.from_seq);
+                buffer.gaps.insert(at, gap.clone());
             }
             Op::Jump(lane, watermark) => {
-                let kept = self.lane_mut(*lane);
-                *kept = LaneKept { produced: *watermark, acked: *watermark, ..LaneKept::default() };
+                let buffer = self.lane_mut(*lane);
+                *buffer = LaneBuffer { produced: *watermark, acked: *watermark, ..LaneBuffer::default() };
             }
             _ => {}
         }

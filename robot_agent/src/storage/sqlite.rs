@@ -7,9 +7,9 @@
 //! alone.
 
 use super::op::Op;
-use super::ring::LaneKept;
+use super::ring::LaneBuffer;
 use super::rows::SubjectRow;
-use super::store::{Error, Kept, Store};
+use super::store::{Error, RobotMemory, Store};
 use async_trait::async_trait;
 use midshift_core::Boxed;
 use midshift_core::ids::Subject;
@@ -85,12 +85,12 @@ impl SqliteStore {
         })
     }
 
-    async fn facts(&mut self, kept: &mut Kept) -> Result<(), Error> {
+    async fn facts(&mut self, memory: &mut RobotMemory) -> Result<(), Error> {
         for row in sqlx::query("SELECT key, value FROM fact").fetch_all(&mut self.connection).await? {
             let (key, value): (String, String) = (row.try_get(0)?, row.try_get(1)?);
-            let ledger = &mut kept.ledger;
+            let ledger = &mut memory.ledger;
             match key.as_str() {
-                "ring" => kept.ring.id = value,
+                "ring" => memory.ring.id = value,
                 "session" => ledger.session = read(&key, &value)?,
                 "applied" => ledger.applied = read(&key, &value)?,
                 "policy" => ledger.policy = read(&key, &value)?,
@@ -108,7 +108,7 @@ impl SqliteStore {
         Ok(())
     }
 
-    async fn subjects(&mut self, kept: &mut Kept) -> Result<(), Error> {
+    async fn subjects(&mut self, memory: &mut RobotMemory) -> Result<(), Error> {
         let all = "SELECT subject, epoch, at_unix_ms, report FROM subject";
         for row in sqlx::query(all).fetch_all(&mut self.connection).await? {
             let name: String = row.try_get(0)?;
@@ -117,38 +117,38 @@ impl SqliteStore {
             let report: Option<String> = row.try_get(3)?;
             let report = report.map(|text| read("report", &text)).transpose()?.map(Arc::new);
             let epoch = row.try_get::<i64, _>(1)? as u64;
-            kept.ledger.put_subject(subject, SubjectRow { epoch, at_unix_ms: row.try_get(2)?, report });
+            memory.ledger.put_subject(subject, SubjectRow { epoch, at_unix_ms: row.try_get(2)?, report });
         }
         for row in sqlx::query("SELECT value FROM unclosed").fetch_all(&mut self.connection).await? {
             let listed: ReportedAttempt = read("unclosed", row.try_get::<String, _>(0)?.as_str())?;
-            kept.ledger.unclosed.insert(listed.attempt.clone(), listed);
+            memory.ledger.unclosed.insert(listed.attempt.clone(), listed);
         }
         Ok(())
     }
 
-    async fn lanes(&mut self, kept: &mut Kept) -> Result<(), Error> {
+    async fn lanes(&mut self, memory: &mut RobotMemory) -> Result<(), Error> {
         for row in sqlx::query("SELECT lane, produced, acked FROM lane").fetch_all(&mut self.connection).await? {
             let Some(lane) = lane_of(row.try_get(0)?) else { continue };
-            let lane = kept.ring.lane_mut(lane);
+            let lane = memory.ring.lane_mut(lane);
             (lane.produced, lane.acked) = (row.try_get::<i64, _>(1)? as u64, row.try_get::<i64, _>(2)? as u64);
         }
         let samples = "SELECT lane, value, seq FROM sample ORDER BY lane, seq";
         for row in sqlx::query(samples).fetch_all(&mut self.connection).await? {
             let Some(lane) = lane_of(row.try_get(0)?) else { continue };
-            let kept = kept.ring.lane_mut(lane);
+            let buffer = memory.ring.lane_mut(lane);
             match serde_json::from_str::<Sample>(row.try_get::<String, _>(1)?.as_str()) {
-                Ok(sample) => kept.samples.push_back(Arc::new(sample)),
-                Err(error) => set_aside(kept, lane, row.try_get::<i64, _>(2)? as u64, &error),
+                Ok(sample) => buffer.samples.push_back(Arc::new(sample)),
+                Err(error) => set_aside(buffer, lane, row.try_get::<i64, _>(2)? as u64, &error),
             }
         }
         let gaps = "SELECT lane, value FROM gap ORDER BY lane, from_seq";
         for row in sqlx::query(gaps).fetch_all(&mut self.connection).await? {
             let Some(lane) = lane_of(row.try_get(0)?) else { continue };
             let gap: Gap = read("gap", row.try_get::<String, _>(1)?.as_str())?;
-            kept.ring.lane_mut(lane).gaps.push_back(gap);
+            memory.ring.lane_mut(lane).gaps.push_back(gap);
         }
         for lane in Lane::ALL {
-            kept.ring.lane_mut(lane).gaps.make_contiguous().sort_by_key(|gap| gap.from_seq);
+            memory.ring.lane_mut(lane).gaps.make_contiguous().sort_by_key(|gap| gap.from_seq);
         }
         Ok(())
     }
@@ -156,15 +156,15 @@ impl SqliteStore {
 
 #[async_trait]
 impl Store for SqliteStore {
-    async fn load(&mut self, new_ring_id: &str) -> Result<Kept, Error> {
+    async fn load(&mut self, new_ring_id: &str) -> Result<RobotMemory, Error> {
         let ring = sqlx::query("INSERT INTO fact (key, value) VALUES ('ring', $1) ON CONFLICT DO NOTHING");
         let ring = ring.bind(new_ring_id);
         ring.execute(&mut self.connection).await?;
-        let mut kept = Kept::new(new_ring_id);
-        self.facts(&mut kept).await?;
-        self.subjects(&mut kept).await?;
-        self.lanes(&mut kept).await?;
-        Ok(kept)
+        let mut memory = RobotMemory::new(new_ring_id);
+        self.facts(&mut memory).await?;
+        self.subjects(&mut memory).await?;
+        self.lanes(&mut memory).await?;
+        Ok(memory)
     }
 
     async fn commit(&mut self, ops: &[Op]) -> Result<(), Error> {
@@ -302,14 +302,14 @@ fn lane_of(number: i64) -> Option<Lane> {
 
 /// A sample of a newer version is said to the server as missing, never in silence; its row stays until that is
 /// acknowledged.
-fn set_aside(kept: &mut LaneKept, lane: Lane, seq: u64, error: &serde_json::Error) {
-    if let Some(gap) = kept.gaps.back_mut().filter(|gap| gap.to_seq + 1 == seq) {
+fn set_aside(buffer: &mut LaneBuffer, lane: Lane, seq: u64, error: &serde_json::Error) {
+    if let Some(gap) = buffer.gaps.back_mut().filter(|gap| gap.to_seq + 1 == seq) {
         gap.to_seq = seq;
         return;
     }
     tracing::warn!(lane = lane.as_str(), seq, %error, "samples of a newer version are told as missing");
     let reason = Reason::from(Code::RowUnknown).with("row", format!("sample/{seq}"));
-    kept.gaps.push_back(Gap { lane, from_seq: seq, to_seq: seq, reason });
+    buffer.gaps.push_back(Gap { lane, from_seq: seq, to_seq: seq, reason });
 }
 
 fn text<T: Serialize>(value: &T) -> Result<String, Error> {

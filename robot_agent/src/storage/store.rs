@@ -1,4 +1,4 @@
-//! The robot's one durable thing: ledger and ring, changed by ordered operations, kept by a [`Store`].
+//! Defines the durable memory of a robot, its ledger and its ring, and the [`Store`] that keeps it by ordered operations.
 //!
 //! Invariant: the core applies an operation to its own copy and hands it out in the same order; nothing that depends on
 //! an operation leaves the robot (a message, a movement) before the batch that holds it is durable. Two stores:
@@ -38,16 +38,16 @@ pub enum Error {
     WrongMode(String),
 }
 
-/// All that a robot remembers.
+/// The durable memory of a robot: its ledger and its ring.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Kept {
-    /// What it remembers of its work.
+pub struct RobotMemory {
+    /// The ledger of its work and software.
     pub ledger: Ledger,
     /// Samples that are not yet acknowledged.
     pub ring: Ring,
 }
 
-impl Kept {
+impl RobotMemory {
     /// Nothing yet, with a ring of this id.
     pub fn new(ring_id: impl Into<String>) -> Self {
         Self { ledger: Ledger::default(), ring: Ring::new(ring_id) }
@@ -60,11 +60,11 @@ impl Kept {
     }
 }
 
-/// Keeps what a robot must remember.
+/// Stores the memory of a robot.
 #[async_trait]
 pub trait Store: Send {
-    /// Everything kept. A new store formats its ring with `new_ring_id`; an old one ignores it.
-    async fn load(&mut self, new_ring_id: &str) -> Result<Kept, Error>;
+    /// Loads the whole memory. A new store formats its ring with `new_ring_id`; an old one ignores it.
+    async fn load(&mut self, new_ring_id: &str) -> Result<RobotMemory, Error>;
     /// Makes these operations durable, in order, all or none.
     async fn commit(&mut self, ops: &[Op]) -> Result<(), Error>;
 }

@@ -79,7 +79,7 @@ fn a_migration_that_fails_is_told_and_tried_again_and_a_newer_bundle_or_the_way_
     let mut rig = relaunch(rig);
     rig.pass(120_000);
     assert_eq!(state(&rig), Some(UpdateState::RolledBack));
-    assert_eq!(rig.store.kept().expect("loaded").ledger.software.due, []);
+    assert_eq!(rig.store.memory().expect("loaded").ledger.software.due, []);
 }
 
 #[test]
@@ -140,7 +140,7 @@ fn a_clock_that_went_back_does_not_count_as_a_day() {
     let (rig, releases) = connected();
     let first = releases.release_base("1.1.0");
     let rig = committed(rig, &releases, &first, 1);
-    let mut row = rig.store.kept().expect("loaded").ledger.software;
+    let mut row = rig.store.memory().expect("loaded").ledger.software;
     row.committed_at = Some(Utc(i64::MAX));
     rig.store.commit_now(&[midshift_agent::store::Op::Software(Box::new(row))]);
     let mut rig = rig.restart();

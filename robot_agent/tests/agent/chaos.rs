@@ -240,7 +240,7 @@ impl Judge {
     /// The body is on its way only into places that it is in or may enter at this moment.
     fn check_path(&self) {
         let now = LinkTime(self.rig.ms);
-        let row = &self.rig.core.kept().ledger.places;
+        let row = &self.rig.core.memory().ledger.places;
         for name in self.rig.body.goes_to() {
             let Some(point) = route().into_iter().find(|p| p.waypoint.as_str() == name) else { continue };
             for place in point.passages.iter().chain(&point.standing) {
@@ -263,7 +263,7 @@ impl Judge {
         assert_eq!(log.acts, self.acts + 1, "two actions at once");
         self.acts = log.acts;
         let Some(StepKind::Action { name, .. }) = log.acting else { return };
-        let holder = self.rig.store.kept().and_then(|k| k.ledger.holder).expect("the ledger knows who acts");
+        let holder = self.rig.store.memory().and_then(|k| k.ledger.holder).expect("the ledger knows who acts");
         assert!(holder.intent.is_some(), "no intent on the disk");
         let begun = self.begun.entry((holder.attempt.clone(), name)).or_default();
         *begun += 1;
@@ -282,7 +282,7 @@ impl Judge {
         let unknown = live.iter().any(|a| a.state == WorkState::StepUnknown);
         assert!(!(busy && unknown), "moves while nobody knows");
         let held: BTreeSet<_> = reported.places.iter().filter(|p| p.inside).map(|p| p.place_id.clone()).collect();
-        assert!(self.rig.core.kept().ledger.places.inside.keys().all(|p| held.contains(p)));
+        assert!(self.rig.core.memory().ledger.places.inside.keys().all(|p| held.contains(p)));
         // Differences count once every number that was given has been heard.
         let settled = reported.produced[&Lane::Event] == self.rig.heard(Lane::Event);
         assert!(

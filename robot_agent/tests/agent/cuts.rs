@@ -87,7 +87,7 @@ fn with_power_cut(at: Option<usize>, last_is_done: bool, way: Way) -> Ended {
         }
         let told = report(&rig).filter(|r| r.bundle.as_str() == second.digest.to_string());
         let ended = |r: &UpdateReport| matches!(r.state, UpdateState::Committed | UpdateState::RolledBack);
-        let migrates = !rig.store.kept().expect("loaded").ledger.software.due.is_empty();
+        let migrates = !rig.store.memory().expect("loaded").ledger.software.due.is_empty();
         if let Some(told) = told.filter(ended).filter(|_| !migrates) {
             let is_committed = told.state == UpdateState::Committed;
             let migrated = migrations(&rig);
@@ -108,7 +108,7 @@ fn all_agree(rig: &mut Rig, told: &UpdateReport, good: &str) {
     let runs = if told.state == UpdateState::Committed { set.as_str() } else { good };
     let record = switch(rig);
     assert_eq!((record.running(), record.trial.as_ref()), (runs, None), "{told:?}");
-    let ledger = rig.store.kept().expect("loaded").ledger.software.update.expect("an update");
+    let ledger = rig.store.memory().expect("loaded").ledger.software.update.expect("an update");
     assert_eq!((ledger.state, ledger.set_name().as_deref()), (told.state, Some(set.as_str())));
     let heard = opens_with(rig).expect("a session begins with it");
     assert_eq!((heard.state, &heard.set), (told.state, &told.set));

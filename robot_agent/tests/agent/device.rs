@@ -32,7 +32,7 @@ fn what_is_shown_of_a_ledger_has_no_secret_in_it() {
     store.commit_now(&[Op::Device(key.clone())]);
     let pem = serde_json::to_value(&key).expect("writes");
     let secret = pem.as_str().and_then(|pem| pem.lines().nth(1)).expect("a line of it");
-    let shown = format!("{:?} {key:?}", store.kept());
+    let shown = format!("{:?} {key:?}", store.memory());
     assert!(secret.len() > 40 && shown.contains("SecretKey(") && !shown.contains(secret), "{shown}");
     assert_eq!(serde_json::from_value::<DeviceKey>(pem.clone()).expect("reads").public(), key.public());
     assert!(serde_json::from_value::<DeviceKey>("no key".into()).is_err());

@@ -283,7 +283,7 @@ impl Shift {
     /// What runs, the switch record, the ledger and all that the server is told say the same of an update that is
     /// over; how it ended.
     fn agree(&mut self, rig: &mut Rig, bundle: &Bundle, good: &str) -> UpdateState {
-        let ledger = rig.store.kept().expect("loaded").ledger.software.update.expect("an update");
+        let ledger = rig.store.memory().expect("loaded").ledger.software.update.expect("an update");
         let set = ledger.set_name().expect("a set");
         let is_kept = ledger.state == UpdateState::Committed;
         let runs = if is_kept { set.as_str() } else { good };

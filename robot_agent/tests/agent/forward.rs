@@ -17,7 +17,7 @@ fn indexed(releases: &Releases, version: &str, index: u64) -> Bundle {
 
 /// What the robot has believed, as it is written down.
 fn believed(rig: &Rig) -> serde_json::Value {
-    let trusted = rig.store.kept().expect("loaded").ledger.trusted.clone().expect("believes something");
+    let trusted = rig.store.memory().expect("loaded").ledger.trusted.clone().expect("believes something");
     serde_json::to_value(&*trusted).expect("is JSON")
 }
 

@@ -6,7 +6,7 @@ use midshift_agent::ledger::{Applied, Holder, PlacesRow, SessionMemory};
 use midshift_agent::memory::MemoryStore;
 use midshift_agent::ring::{Item, Ring};
 use midshift_agent::sqlite::SqliteStore;
-use midshift_agent::store::{Kept, Op, Store};
+use midshift_agent::store::{Op, RobotMemory, Store};
 use midshift_core::ids::AttemptId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
@@ -17,16 +17,16 @@ use std::sync::Arc;
 
 /// Writes through the core's copy into a store and reads the store again, as a restart does.
 struct Bench<F: AsyncFn() -> Box<dyn Store>> {
-    kept: Kept,
+    memory: RobotMemory,
     open: F,
 }
 
 impl<F: AsyncFn() -> Box<dyn Store>> Bench<F> {
     async fn new(open: F) -> Self {
-        Self { kept: open().await.load("ring-1").await.expect("loads"), open }
+        Self { memory: open().await.load("ring-1").await.expect("loads"), open }
     }
     async fn write(&mut self, ops: Vec<Op>) {
-        ops.iter().for_each(|op| self.kept.apply(op));
+        ops.iter().for_each(|op| self.memory.apply(op));
         (self.open)().await.commit(&ops).await.expect("commits");
     }
     async fn append(&mut self, lane: Lane) {
@@ -34,17 +34,17 @@ impl<F: AsyncFn() -> Box<dyn Store>> Bench<F> {
             Lane::Status => SampleBody::Status(Vitals::default()),
             _ => SampleBody::Event(RobotEvent::Mode(Mode::Manual)),
         };
-        let ops = self.kept.ring.append(lane, 7, body);
+        let ops = self.memory.ring.append(lane, 7, body);
         self.write(ops).await;
     }
     /// Everything survives: what was read back is what was written.
     async fn restart(&mut self) {
         let read = (self.open)().await.load("another").await.expect("loads");
-        assert_eq!(read, self.kept);
-        self.kept = read;
+        assert_eq!(read, self.memory);
+        self.memory = read;
     }
     fn ring(&self) -> &Ring {
-        &self.kept.ring
+        &self.memory.ring
     }
 }
 
@@ -74,8 +74,8 @@ async fn an_overflow_thins_old_status_with_a_gap_and_nothing_else(open: impl Asy
     bench.append(Lane::Critical).await;
     let mut ops = Vec::new();
     for _ in 0..2 * limits::RING_STATUS_MAX {
-        let more = bench.kept.ring.append(Lane::Status, 7, SampleBody::Status(Vitals::default()));
-        more.iter().for_each(|op| bench.kept.apply(op));
+        let more = bench.memory.ring.append(Lane::Status, 7, SampleBody::Status(Vitals::default()));
+        more.iter().for_each(|op| bench.memory.apply(op));
         ops.extend(more);
     }
     (bench.open)().await.commit(&ops).await.expect("commits");
@@ -177,14 +177,14 @@ async fn the_ledger_is_read_back_as_it_was_written(open: impl AsyncFn() -> Box<d
         ])
         .await;
     bench.restart().await;
-    let ledger = &bench.kept.ledger;
+    let ledger = &bench.memory.ledger;
     assert_eq!((ledger.highest_epoch(&done.subject), ledger.highest_epoch(&attempt("T3", 1).subject)), (4, 8));
     assert!(ledger.finished(&done.subject).is_some());
     assert_eq!(ledger.device, Some(DeviceKey::of_seed([9; 32])));
     assert!(ledger.forgettable(i64::MAX / 2).is_empty(), "few subjects are kept whatever their age");
     bench.write(vec![Op::Closed(done.clone()), Op::Holder(None), Op::Forget(attempt("T3", 1).subject)]).await;
     bench.restart().await;
-    assert_eq!((bench.kept.ledger.unclosed.len(), bench.kept.ledger.subjects().len()), (0, 1));
+    assert_eq!((bench.memory.ledger.unclosed.len(), bench.memory.ledger.subjects().len()), (0, 1));
 }
 
 macro_rules! contract {
@@ -244,7 +244,7 @@ fn nothing_is_sent_before_it_is_durable() {
     rig.slow_disk = true;
     rig.body.says(midshift_agent::body::BodyNews::Mode(Mode::Manual));
     rig.pass(1_000);
-    assert_eq!((seqs(&rig, Lane::Event), rig.core.kept().ring.lane(Lane::Event).produced), (vec![], 1));
+    assert_eq!((seqs(&rig, Lane::Event), rig.core.memory().ring.lane(Lane::Event).produced), (vec![], 1));
     rig.flush();
     assert_eq!(seqs(&rig, Lane::Event), [1]);
 }

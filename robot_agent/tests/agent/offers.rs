@@ -44,9 +44,9 @@ fn an_offer_is_on_the_ledger_before_anybody_hears_of_it_and_before_the_body_move
     rig.slow_disk = true;
     rig.work(rig.desired(Some(drive(&rig, "T1", 1))));
     assert_eq!((rig.states(), rig.body.goes_to()), (vec![], vec![]));
-    assert!(rig.store.kept().expect("loaded").ledger.holder.is_none());
+    assert!(rig.store.memory().expect("loaded").ledger.holder.is_none());
     rig.flush();
-    let holder = rig.store.kept().expect("loaded").ledger.holder.expect("a holder");
+    let holder = rig.store.memory().expect("loaded").ledger.holder.expect("a holder");
     assert_eq!(holder.attempt, attempt("T1", 1));
     assert_eq!(rig.body.goes_to(), ["B"]);
     assert_eq!(rig.states(), [(WorkState::Accepted, 0), (WorkState::Navigating, 0)]);

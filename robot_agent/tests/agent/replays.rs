@@ -50,7 +50,7 @@ fn back_after(ms: u64) -> Rig {
 }
 
 fn produced(rig: &Rig) -> u64 {
-    rig.core.kept().ring.lane(Lane::Status).produced
+    rig.core.memory().ring.lane(Lane::Status).produced
 }
 
 fn answer(rig: &mut Rig, replayed: Replayed) {
@@ -96,7 +96,7 @@ fn after_a_break_events_come_first_then_the_live_heartbeat_and_old_status_goes_b
     stored(&mut rig);
     rig.pass(20_000);
     assert_eq!((rig.replays.len(), on_link(&rig, Lane::Status)[0]), (2, all + 1), "and then it is live");
-    assert!(rig.core.kept().ring.lane(Lane::Status).acked == all);
+    assert!(rig.core.memory().ring.lane(Lane::Status).acked == all);
 }
 
 #[test]
@@ -133,7 +133,7 @@ fn a_server_that_does_not_know_the_call_gets_it_on_the_session_at_a_quarter_of_t
     let first = on_link(&rig, Lane::Status);
     assert_eq!((first[0], first.len()), (1, 64 * 1024 / 4 / 192));
     // Acknowledged in steps, everything comes, in order and once.
-    while rig.core.kept().ring.lane(Lane::Status).acked < old {
+    while rig.core.memory().ring.lane(Lane::Status).acked < old {
         let sent = *on_link(&rig, Lane::Status).last().expect("some");
         rig.down(Downlink { acks: vec![ack(Lane::Status, sent)], ..Downlink::default() });
         rig.pass(1_000);

@@ -32,11 +32,11 @@ fn an_intent_is_on_the_ledger_before_the_body_begins_what_must_not_be_done_twice
     let (batch, ops) = rig.unwritten.take().expect("a batch");
     rig.store.commit_now(&ops);
     rig.give(midshift_agent::core::Input::Persisted(batch));
-    let holder = rig.store.kept().expect("loaded").ledger.holder;
+    let holder = rig.store.memory().expect("loaded").ledger.holder;
     assert_eq!((rig.body.log().acts, holder.and_then(|h| h.intent)), (1, None));
     rig.flush();
     assert_eq!(rig.body.log().acts, 2);
-    let holder = rig.store.kept().expect("loaded").ledger.holder.expect("a holder");
+    let holder = rig.store.memory().expect("loaded").ledger.holder.expect("a holder");
     assert_eq!((holder.attempt, holder.intent.map(|i| i.step)), (attempt("T1", 1), Some(0)));
 }
 

@@ -164,12 +164,12 @@ impl Rig {
         Self::new(TestBody::at("A"), MemoryStore::new(), bugs, Some(Updates::for_releases(releases)), START_MS, stop)
     }
     fn new(body: TestBody, store: MemoryStore, bugs: Bugs, updates: Option<Updates>, ms: u64, stop: StopDesk) -> Self {
-        let kept = store.load_now("ring-1");
+        let memory = store.load_now("ring-1");
         let update = updates.as_ref().map(|u| u.releases.config());
         let config =
             CoreConfig { robot_id: RobotId::parse("rbt-01").expect("a name"), bugs, update, server_is_proven: true };
         let now = clocks_at(ms, updates.as_ref());
-        let mut core = AgentCore::new(config, Box::new(body.clone()), kept, now);
+        let mut core = AgentCore::new(config, Box::new(body.clone()), memory, now);
         if stop.is_there {
             core.obeys_stops(Loaded { saved: stop.saved.clone(), is_durable: true }, LinkTime(ms));
         }
@@ -221,7 +221,7 @@ impl Rig {
                     }
                     Output::Job(job) => {
                         if matches!(*job, Job::Migrate { .. }) {
-                            let row = self.store.kept().expect("loaded").ledger.software.update;
+                            let row = self.store.memory().expect("loaded").ledger.software.update;
                             assert_eq!(row.map(|u| u.state), Some(UpdateState::Committed), "it is durable");
                         }
                         let (happens, is_heard) = self.effect();

@@ -473,7 +473,7 @@ async fn a_robot_signs_what_it_has_installed_in_its_first_hello_with_a_key_that_
         bench.end().await;
     }
     assert_eq!(keys[0], keys[1]);
-    assert_eq!(store.kept().and_then(|kept| kept.ledger.device).map(|key| key.public()), Some(keys.remove(0)));
+    assert_eq!(store.memory().and_then(|kept| kept.ledger.device).map(|key| key.public()), Some(keys.remove(0)));
 }
 
 #[tokio::test(start_paused = true)]

@@ -181,7 +181,7 @@ fn what_cannot_be_had_anew_is_gone_back_from_if_the_way_is_open() {
     type Change = fn(&Rig);
     let open: Change = |_| {};
     let below: Change = |rig| {
-        let mut software = rig.store.kept().expect("loaded").ledger.software;
+        let mut software = rig.store.memory().expect("loaded").ledger.software;
         software.floors.insert("gait".to_owned(), 9);
         rig.store.commit_now(&[Op::Software(Box::new(software))]);
     };
@@ -264,7 +264,7 @@ fn begun_to_commit(mut rig: Rig, mut order: Order) -> Rig {
 
 /// The ledger has a commit that the switch record is about to say.
 fn is_intended(rig: &Rig) -> bool {
-    let ledger = rig.store.kept().expect("loaded").ledger;
+    let ledger = rig.store.memory().expect("loaded").ledger;
     ledger.proven.is_some_and(|proven| proven.intended.is_some())
 }
 
@@ -279,7 +279,7 @@ fn a_changed_program_is_not_committed_though_the_ledger_has_begun_to() {
     rig.pass(1_000);
     assert_eq!((state(&rig), why(&rig)), (Some(UpdateState::RolledBack), Some(Code::RunningSetBad)));
     assert_eq!((switch(&rig).running(), is_intended(&rig)), (FACTORY, false));
-    assert_eq!(rig.store.kept().expect("loaded").ledger.software.committed_at, None);
+    assert_eq!(rig.store.memory().expect("loaded").ledger.software.committed_at, None);
 }
 
 #[test]
@@ -307,7 +307,7 @@ fn a_set_on_trial_that_nobody_signed_is_ended_beside_an_update_that_goes_on() {
     for on_its_way in [UpdateState::Directed, UpdateState::Downloading, UpdateState::Staged] {
         let (mut rig, releases) = connected();
         let mut order = stage(&mut rig, &releases, &releases.release("1.1.0"), 1);
-        let mut software = rig.store.kept().expect("loaded").ledger.software;
+        let mut software = rig.store.memory().expect("loaded").ledger.software;
         let update = software.update.as_mut().expect("is staged");
         update.state = on_its_way;
         if on_its_way == UpdateState::Directed {
@@ -334,7 +334,7 @@ fn a_set_that_an_agent_without_documents_committed_is_believed_once() {
     let mut rig = committed(rig, &releases, &releases.release("1.1.0"), 1);
     let good = name_of(&rig);
     // The ledger as such an agent has left it.
-    let software = rig.store.kept().expect("loaded").ledger.software;
+    let software = rig.store.memory().expect("loaded").ledger.software;
     rig.store = MemoryStore::new();
     rig.store.load_now("ring-2");
     rig.store.commit_now(&[Op::Software(Box::new(software))]);
@@ -357,7 +357,7 @@ fn documents_are_kept_of_what_may_run_and_of_no_more() {
         rig = committed(rig, &releases, &next, n);
         bundles.push(next.digest);
     }
-    let proven = rig.store.kept().expect("loaded").ledger.proven.expect("was written");
+    let proven = rig.store.memory().expect("loaded").ledger.proven.expect("was written");
     let kept: BTreeSet<Digest> = [bundles[0], bundles[3], bundles[4]].into();
     assert_eq!(proven.releases.keys().copied().collect::<BTreeSet<_>>(), kept);
     assert_eq!((proven.sets.len(), proven.believed.len()), (2, 0));
@@ -370,7 +370,7 @@ fn documents_are_kept_of_what_may_run_and_of_no_more() {
 fn a_set_counts_only_with_its_documents_and_what_stands_in_them() {
     let (rig, releases) = connected();
     let rig = committed(rig, &releases, &releases.release("1.1.0"), 1);
-    let proven = rig.store.kept().expect("loaded").ledger.proven.expect("was written");
+    let proven = rig.store.memory().expect("loaded").ledger.proven.expect("was written");
     let good = proven.sets.values().next().expect("one set").clone();
     assert_eq!(proven.check(&good), Ok(()));
     let mut without = Proven::clone(&proven);

@@ -120,7 +120,7 @@ struct Hung(MemoryStore);
 
 #[async_trait]
 impl Store for Hung {
-    async fn load(&mut self, new_ring_id: &str) -> Result<store::Kept, store::Error> {
+    async fn load(&mut self, new_ring_id: &str) -> Result<store::RobotMemory, store::Error> {
         self.0.load(new_ring_id).await
     }
     async fn commit(&mut self, ops: &[Op]) -> Result<(), store::Error> {

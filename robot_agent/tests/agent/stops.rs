@@ -126,7 +126,7 @@ pub fn speeds(rig: &Rig) -> Vec<u32> {
 /// What people resumed and whether there is a fresh permission to go on.
 pub fn resume(rig: &mut Rig, resumed: &[StopId], is_permitted: bool) {
     let resume = is_permitted.then(|| rig.authority(10_000));
-    let order = rig.core.kept().ledger.holder.is_some().then(|| to_c(rig));
+    let order = rig.core.memory().ledger.holder.is_some().then(|| to_c(rig));
     rig.work(DesiredWork { resumed: resumed.to_vec(), resume, ..rig.desired(order) });
 }
 

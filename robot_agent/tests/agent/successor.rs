@@ -20,7 +20,7 @@ use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::stop::storage::{FileStops, STOP_FILE, StopStorage, unreadable};
 use midshift_agent::storage::Proven;
-use midshift_agent::store::{Kept, Op, Store};
+use midshift_agent::store::{Op, RobotMemory, Store};
 use midshift_agent::trust::Trust;
 use midshift_agent::update::{DueMigration, HeldKeys, SoftwareRow, Update};
 use midshift_bundle::digest::Digest;
@@ -181,22 +181,22 @@ fn rows(state: UpdateState) -> Vec<Op> {
 }
 
 /// What is there after a start.
-async fn started(path: &Path) -> (SqliteStore, Kept) {
+async fn started(path: &Path) -> (SqliteStore, RobotMemory) {
     let mut store = SqliteStore::open(path).await.expect("opens");
-    let kept = store.load("ring-1").await.expect("loads");
-    (store, kept)
+    let memory = store.load("ring-1").await.expect("loads");
+    (store, memory)
 }
 
 /// Writes these rows, and as many samples into each lane.
-async fn write(path: &Path, mut ops: Vec<Op>, samples: usize) -> Kept {
-    let (mut store, mut kept) = started(path).await;
+async fn write(path: &Path, mut ops: Vec<Op>, samples: usize) -> RobotMemory {
+    let (mut store, mut memory) = started(path).await;
     for lane in Lane::ALL.into_iter().flat_map(|lane| std::iter::repeat_n(lane, samples)) {
         let body = match lane {
             Lane::Status => SampleBody::Status(Vitals::default()),
             _ => SampleBody::Event(RobotEvent::Mode(Mode::Manual)),
         };
-        let appended = kept.ring.append(lane, 7, body);
-        appended.iter().for_each(|op| kept.apply(op));
+        let appended = memory.ring.append(lane, 7, body);
+        appended.iter().for_each(|op| memory.apply(op));
         ops.extend(appended);
     }
     store.commit(&ops).await.expect("commits");
@@ -234,12 +234,12 @@ async fn samples_of_a_newer_version_are_told_as_missing_and_stay_until_that_is_a
     let dreams = r#"UPDATE sample SET value = json_set(value, '$.body', json('{"dream":{"of":"sheep"}}'))
         WHERE lane = 1 AND seq IN (2, 3)"#;
     Successor::open(&path).await.writes(dreams).await;
-    let (mut store, kept) = started(&path).await;
-    let lane = kept.ring.lane(Lane::Event);
+    let (mut store, memory) = started(&path).await;
+    let lane = memory.ring.lane(Lane::Event);
     assert_eq!((lane.produced, lane.samples.iter().map(|s| s.seq).collect::<Vec<_>>()), (4, vec![1, 4]));
-    let Some(Item::Gap(gap)) = kept.ring.after(Lane::Event, 1) else { panic!("{lane:?}") };
+    let Some(Item::Gap(gap)) = memory.ring.after(Lane::Event, 1) else { panic!("{lane:?}") };
     assert_eq!((gap.from_seq, gap.to_seq, gap.reason.code), (2, 3, Code::RowUnknown));
-    assert!(matches!(kept.ring.after(Lane::Event, 3), Some(Item::Sample(sample)) if sample.seq == 4));
+    assert!(matches!(memory.ring.after(Lane::Event, 3), Some(Item::Sample(sample)) if sample.seq == 4));
     let dreamt = "SELECT count(*) FROM sample WHERE value LIKE '%sheep%'";
     assert_eq!(Successor::open(&path).await.number(dreamt).await, 2, "the newer version may come back and say them");
     store.commit(&[Op::Free(Lane::Event, 4)]).await.expect("commits");

@@ -114,7 +114,7 @@ async fn floor_after(link: TcpDial, mut sessions: mpsc::Receiver<Seen>, told: Ut
     session.next().await.expect("a heartbeat");
     shutdown.cancel();
     agent.await.expect("no panic").expect("no error");
-    store.kept().expect("loaded").ledger.trusted.expect("believes").time_floor()
+    store.memory().expect("loaded").ledger.trusted.expect("believes").time_floor()
 }
 
 #[tokio::test]
@@ -143,7 +143,7 @@ fn the_floor_rises_within_two_days_of_the_newest_signature_and_never_falls() {
         rig.down(Downlink { echo: Some(Echo { hb: 1, clock, is_clock_doubted }), ..Downlink::default() });
         // It is written with what comes next.
         rig.pass(2_000);
-        rig.store.kept().expect("loaded").ledger.trusted.map(|t| (t.time_floor().0 - SIGNED.0) / 3_600_000)
+        rig.store.memory().expect("loaded").ledger.trusted.map(|t| (t.time_floor().0 - SIGNED.0) / 3_600_000)
     };
     let floor_at = |rig: &mut Rig, hours: u64| floor_after(rig, hours, false);
     assert_eq!(floor_at(&mut rig, 9), None, "nothing signed has said any time yet");

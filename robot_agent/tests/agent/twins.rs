@@ -78,7 +78,7 @@ fn obeys_an_old_order_again(bugs: &[SeededBug]) -> bool {
         order.generation = 100 * (n as u64 + 1);
         want(&mut rig, order.to(Goal::Stage));
     }
-    let bundle = rig.core.kept().ledger.software.update.as_ref().map(|update| update.bundle);
+    let bundle = rig.core.memory().ledger.software.update.as_ref().map(|update| update.bundle);
     bundle == Some(old.digest)
 }
 

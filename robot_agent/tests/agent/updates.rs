@@ -63,7 +63,7 @@ pub fn maintain(rig: &mut Rig, drain_id: Option<&DrainId>) {
 }
 
 pub fn report(rig: &Rig) -> Option<UpdateReport> {
-    rig.store.kept().expect("loaded").ledger.software.report(0)
+    rig.store.memory().expect("loaded").ledger.software.report(0)
 }
 
 pub fn state(rig: &Rig) -> Option<UpdateState> {
@@ -383,7 +383,7 @@ fn a_robot_in_a_passage_does_not_change_its_software() {
     work.maintenance = Some(drain("drain-1"));
     work.grants = vec![midshift_core::work::GrantedPlace { place_id: place_id("P1"), grant_id: 5, entry: None }];
     order.drain_id = work.maintenance.clone();
-    let mut places = rig.store.kept().expect("loaded").ledger.places;
+    let mut places = rig.store.memory().expect("loaded").ledger.places;
     places.inside.insert(place_id("P1"), 5);
     rig.store.commit_now(&[midshift_agent::store::Op::Places(places)]);
     let mut rig = rig.restart();
@@ -418,7 +418,7 @@ fn a_grant_is_used_once() {
     let (rig, releases) = connected();
     let first = releases.release("1.1.0");
     let (mut rig, mut order) = on_trial(rig, &releases, &first, 1);
-    let used = rig.store.kept().expect("loaded").ledger.software.grant_id;
+    let used = rig.store.memory().expect("loaded").ledger.software.grant_id;
     want(&mut rig, order.to(Goal::Revert));
     let mut rig = relaunch(rig);
     rig.pass(1_000);
@@ -496,7 +496,7 @@ fn an_order_for_the_set_that_runs_already_is_answered_and_changes_nothing() {
 fn a_floor_rises_with_a_commit_never_above_what_is_kept_and_never_on_trial() {
     let (rig, releases) = connected();
     let indexed = |version: &str, index: u64| releases.release_as(version, |m| m.components[0].rollback_index = index);
-    let floor = |rig: &Rig| rig.store.kept().expect("loaded").ledger.software.floors.get("gait").copied();
+    let floor = |rig: &Rig| rig.store.memory().expect("loaded").ledger.software.floors.get("gait").copied();
     let rig = committed(rig, &releases, &indexed("1.1.0", 3), 1);
     assert_eq!(floor(&rig), Some(3), "what the robot came with has no index");
     let (rig, _) = on_trial(rig, &releases, &indexed("1.2.0", 5), 2);

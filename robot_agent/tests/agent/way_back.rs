@@ -41,7 +41,7 @@ fn a_set_that_was_put_away_while_it_was_being_committed_is_fallen_and_moves_no_f
     });
     let (rig, mut order) = on_trial(rig, &releases, &bundle, 1);
     // The power went before the switch record was written, and the launcher put the set away.
-    let mut software = rig.store.kept().expect("loaded").ledger.software;
+    let mut software = rig.store.memory().expect("loaded").ledger.software;
     software.update.as_mut().expect("an update").state = UpdateState::Committing;
     rig.store.commit_now(&[midshift_agent::store::Op::Software(Box::new(software))]);
     rig.updates.as_ref().expect("has them").sets.fall_back(2);
@@ -52,7 +52,7 @@ fn a_set_that_was_put_away_while_it_was_being_committed_is_fallen_and_moves_no_f
     let told = report(&rig).expect("a report");
     let why = told.reason.map(|reason| reason.code);
     assert_eq!((told.state, told.tries, why), (UpdateState::RolledBack, 2, Some(Code::ProgramCrashed)));
-    let software = rig.store.kept().expect("loaded").ledger.software;
+    let software = rig.store.memory().expect("loaded").ledger.software;
     assert_eq!((software.floors.len(), software.due.len(), software.committed_at), (0, 0, None));
     assert_eq!((migrations(&rig), switch(&rig).running()), (vec![], "factory"));
 }

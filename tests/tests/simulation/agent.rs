@@ -14,7 +14,7 @@ use midshift_agent::body::Body;
 use midshift_agent::bugs::Bugs;
 use midshift_agent::bulk::Bulk;
 use midshift_agent::core::ExitReason;
-use midshift_agent::memory::MemoryStore as RobotMemory;
+use midshift_agent::memory::MemoryStore as RobotMemoryStore;
 use midshift_agent::session::{self, AgentConfig, Lines, Updates};
 use midshift_agent::start_policy::HANG_SECONDS;
 use midshift_agent::trust::Trust;
@@ -49,7 +49,7 @@ pub struct Agent {
     /// Its line to the stop service, and what it keeps of stops; none: it has no such line.
     pub stop: Option<stops::RobotLine>,
     /// Ledger and ring.
-    pub memory: RobotMemory,
+    pub memory: RobotMemoryStore,
     /// Its sets, and who starts them.
     pub launched: Arc<Launched>,
     /// What it believes.

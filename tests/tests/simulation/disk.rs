@@ -4,8 +4,8 @@
 
 use crate::newer::Newer;
 use crate::observer::Shared;
-use midshift_agent::memory::MemoryStore as RobotMemory;
-use midshift_agent::store::{Error as RobotError, Kept, Op, Store as RobotStore};
+use midshift_agent::memory::MemoryStore as RobotMemoryStore;
+use midshift_agent::store::{Error as RobotError, Op, RobotMemory, Store as RobotStore};
 use midshift_core::audit::Head;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::rows::{Item, Key, Log, Naming, Part, Row, Seq, Writer};
@@ -225,7 +225,7 @@ impl FrameLog for ServerFrames {
 
 /// A robot's disk: each write takes some milliseconds, and a crash in them loses it.
 pub struct RobotDisk {
-    inner: RobotMemory,
+    inner: RobotMemoryStore,
     robot_id: RobotId,
     observer: Shared,
     rng: StdRng,
@@ -233,14 +233,14 @@ pub struct RobotDisk {
 
 impl RobotDisk {
     /// A handle of one process on what outlives it.
-    pub fn open(inner: RobotMemory, robot_id: RobotId, observer: Shared, seed: u64) -> Self {
+    pub fn open(inner: RobotMemoryStore, robot_id: RobotId, observer: Shared, seed: u64) -> Self {
         Self { inner, robot_id, observer, rng: StdRng::seed_from_u64(seed) }
     }
 }
 
 #[async_trait::async_trait]
 impl RobotStore for RobotDisk {
-    async fn load(&mut self, new_ring_id: &str) -> Result<Kept, RobotError> {
+    async fn load(&mut self, new_ring_id: &str) -> Result<RobotMemory, RobotError> {
         Ok(self.inner.load_now(new_ring_id))
     }
     async fn commit(&mut self, ops: &[Op]) -> Result<(), RobotError> {

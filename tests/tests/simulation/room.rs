@@ -15,7 +15,7 @@ use crate::stops::Stops;
 use crate::wall::ServerWall;
 use midshift_agent::body::Body;
 use midshift_agent::bugs::Bugs;
-use midshift_agent::memory::MemoryStore as RobotMemory;
+use midshift_agent::memory::MemoryStore as RobotMemoryStore;
 use midshift_cli::roles::Roles;
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::StopLevel;
@@ -163,7 +163,7 @@ impl Room {
                 ear: ear.clone(),
                 wire: wire.clone(),
                 stop: stop.as_ref().map(|stops| stops.line(robot)),
-                memory: RobotMemory::new(),
+                memory: RobotMemoryStore::new(),
                 launched: launched[robot].clone(),
                 trust: software.trust.clone(),
                 bugs: config.naive.agent,

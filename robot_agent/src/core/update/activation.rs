@@ -42,13 +42,13 @@ impl AgentCore {
 
     /// Whether this drain holds the robot.
     fn is_held_by(&self, drain_id: &DrainId) -> bool {
-        let held = self.kept.ledger.maintenance.as_ref();
+        let held = self.memory.ledger.maintenance.as_ref();
         held == Some(drain_id) || (self.config.bugs.any_drain_will_do() && held.is_some())
     }
 
     /// Whether the software changes, or is not yet believed: no work is taken.
     pub(crate) fn changes_software(&self) -> bool {
-        let state = self.kept.ledger.software.update.as_ref().map(|u| u.state);
+        let state = self.memory.ledger.software.update.as_ref().map(|u| u.state);
         matches!(state, Some(UpdateState::Switching | UpdateState::Probation | UpdateState::RollingBack))
     }
 
@@ -57,7 +57,7 @@ impl AgentCore {
         // Not the waypoint that it passed last: it may have left it since.
         let here = self.body.stands_on();
         let standing = |place: &PlaceId| here.iter().any(|w| w.as_str() == place.as_str());
-        let row = &self.kept.ledger.places;
+        let row = &self.memory.ledger.places;
         row.inside.keys().chain(row.committed.keys()).any(|place| !standing(place))
     }
 
@@ -71,7 +71,7 @@ impl AgentCore {
 
     /// A switch that waits for the disk is not made once something came between.
     pub(super) fn take_switch_back(&mut self, now: &Now) {
-        let update = self.kept.ledger.software.update.as_ref().filter(|u| u.state == UpdateState::Switching);
+        let update = self.memory.ledger.software.update.as_ref().filter(|u| u.state == UpdateState::Switching);
         let waits = matches!(self.update.next, Some((Job::Write(_), _)));
         if waits && update.is_some_and(|update| self.may_switch(now, update).is_err()) {
             self.update.next = None;
@@ -79,7 +79,7 @@ impl AgentCore {
     }
 
     pub(super) fn note_blocked(&mut self, reason: Reason) {
-        let Some(update) = self.kept.ledger.software.update.clone() else { return };
+        let Some(update) = self.memory.ledger.software.update.clone() else { return };
         if update.reason.as_ref() != Some(&reason) {
             self.put_update(Update { reason: Some(reason), ..update });
         }

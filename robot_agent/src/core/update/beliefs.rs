@@ -38,14 +38,14 @@ impl AgentCore {
     pub(super) fn trusted(&mut self) -> Result<Trusted, Reason> {
         let unreadable = |e: trust::Error| Reason::new(Code::MetadataRefused, e.to_string());
         let root = self.update.config.as_ref().map(|c| c.root.clone());
-        let Some(before) = self.kept.ledger.trusted.clone() else {
+        let Some(before) = self.memory.ledger.trusted.clone() else {
             return Trusted::new(&root.unwrap_or_default()).map_err(unreadable);
         };
         let Some(root) = root else { return Ok(Trusted::clone(&before)) };
         let trusted = before.from_root(&root).map_err(unreadable)?;
         if trusted != *before {
             if !trusted.shares_root_key(&before).map_err(unreadable)? {
-                self.put_software(SoftwareRow { keys: None, ..self.kept.ledger.software.clone() });
+                self.put_software(SoftwareRow { keys: None, ..self.memory.ledger.software.clone() });
             }
             self.write(Op::Trusted(Arc::new(trusted.clone())), true);
         }
@@ -54,7 +54,7 @@ impl AgentCore {
 
     /// Notes since when the time floor is what it is, by the robot's own clock.
     pub(super) fn note_floor(&mut self, now: &Now) {
-        let floor = self.kept.ledger.trusted.as_ref().map_or(Utc(0), |trusted| trusted.time_floor());
+        let floor = self.memory.ledger.trusted.as_ref().map_or(Utc(0), |trusted| trusted.time_floor());
         if self.update.floor.is_none_or(|(known, _)| known != floor) {
             self.update.floor = Some((floor, now.link));
         }
@@ -77,7 +77,7 @@ impl AgentCore {
             return;
         }
         self.update.told = Some(time);
-        if let Some(trusted) = self.kept.ledger.trusted.as_ref().and_then(|trusted| trusted.told(time)) {
+        if let Some(trusted) = self.memory.ledger.trusted.as_ref().and_then(|trusted| trusted.told(time)) {
             self.write(Op::Trusted(Arc::new(trusted)), false);
         }
     }
@@ -86,7 +86,7 @@ impl AgentCore {
     /// since count instead.
     fn directive_keys(&self) -> Current {
         let own = self.update.config.as_ref().map(|c| c.directive_keys.clone()).unwrap_or_default();
-        let held = self.kept.ledger.software.keys.as_ref();
+        let held = self.memory.ledger.software.keys.as_ref();
         let number = held.map_or(0, |held| held.number);
         match held.filter(|held| held.from.iter().eq(own.keys())) {
             Some(held) => Current { number, keys: held.keys.iter().map(|key| (key.id(), key.clone())).collect() },
@@ -108,7 +108,7 @@ impl AgentCore {
         tracing::info!(robot_id = %self.config.robot_id, number = current.number, ?keys, "directives are taken of other keys");
         let from = self.update.config.iter().flat_map(|c| c.directive_keys.keys().copied()).collect();
         let held = HeldKeys { number: current.number, keys: current.keys.into_values().collect(), from };
-        self.put_software(SoftwareRow { keys: Some(held), ..self.kept.ledger.software.clone() });
+        self.put_software(SoftwareRow { keys: Some(held), ..self.memory.ledger.software.clone() });
     }
 
     pub(super) fn ask_to_refresh(&mut self, now: &Now, trusted: Trusted, clock: Reading) {
@@ -134,7 +134,7 @@ impl AgentCore {
     pub(super) fn believe_what_came(&mut self, done: Done) -> Done {
         match done {
             Done::Believed { trusted, failure } => {
-                let floor = self.kept.ledger.trusted.as_ref().map_or(Utc(0), |known| known.time_floor());
+                let floor = self.memory.ledger.trusted.as_ref().map_or(Utc(0), |known| known.time_floor());
                 self.write(Op::Trusted(Arc::new(trusted.at_least(floor))), true);
                 Done::Failed(failure)
             }
@@ -181,7 +181,7 @@ impl AgentCore {
                     probation_ms: desired.probation_ms,
                     reason: None,
                 };
-                let row = self.kept.ledger.software.with(&directive, &desired);
+                let row = self.memory.ledger.software.with(&directive, &desired);
                 self.put_software(row);
                 self.put_update(update);
             }
@@ -193,7 +193,7 @@ impl AgentCore {
     /// to, and the order is looked at after that. One that is stuck still does not take it.
     fn goes_back_first(&mut self, desired: &DesiredUpdate) -> bool {
         let on_trial = self.update.holdings.as_ref().is_some_and(|holdings| holdings.switch.trial.is_some());
-        let stuck = self.kept.ledger.software.update.clone().filter(|u| on_trial && u.state == UpdateState::Stuck);
+        let stuck = self.memory.ledger.software.update.clone().filter(|u| on_trial && u.state == UpdateState::Stuck);
         let Some(update) = stuck else { return false };
         if self.update.back_first.as_ref() == Some(&desired.directive) {
             self.refuse_directive(update.reason.unwrap_or_else(|| Code::KeptSetBad.into()));
@@ -208,7 +208,7 @@ impl AgentCore {
 
     fn open(&self, desired: &DesiredUpdate, now: Utc) -> Result<Directive, Reason> {
         let bugs = self.config.bugs;
-        let newest = if bugs.replays_are_taken() { 0 } else { self.kept.ledger.software.directive_generation };
+        let newest = if bugs.replays_are_taken() { 0 } else { self.memory.ledger.software.directive };
         let directive = self.opened(desired, newest, now).map_err(|rejection| refusal_of(&rejection))?;
         if self.lists(&directive.manifest, directive.manifest_length) || bugs.unlisted_is_fine() {
             Ok(directive)
@@ -227,7 +227,7 @@ impl AgentCore {
     /// Whether the envelope is the one that was taken last: after a restart it comes again. What was taken does not
     /// expire, nor with its key.
     pub(super) fn is_the_newest(&self, desired: &DesiredUpdate) -> bool {
-        let software = &self.kept.ledger.software;
+        let software = &self.memory.ledger.software;
         if software.envelope == Some(Digest::of_content(desired.directive.as_bytes())) {
             return true;
         }

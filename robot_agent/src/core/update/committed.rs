@@ -12,14 +12,14 @@ use midshift_core::update::UpdateState;
 impl AgentCore {
     /// The next migration of a committed set. False: nothing is due.
     pub(super) fn migrate(&mut self, holdings: &Holdings) -> bool {
-        let Some(due) = self.kept.ledger.software.due.first().cloned() else { return false };
+        let Some(due) = self.memory.ledger.software.due.first().cloned() else { return false };
         let Ok(set) = holdings.switch.running().parse() else { return false };
         self.ask_for(Job::Migrate { set, due });
         true
     }
 
     pub(super) fn migrated(&mut self, done: &DueMigration) {
-        let mut row = self.kept.ledger.software.clone();
+        let mut row = self.memory.ledger.software.clone();
         row.due.retain(|due| due != done);
         let reason = row.due.first().map(Self::is_due);
         let update = row.update.clone();
@@ -29,7 +29,7 @@ impl AgentCore {
 
     pub(super) fn not_migrated(&mut self, due: &DueMigration, why: &str) {
         let reason = Reason::from(Code::MigrationFailed).with("component", &due.component).with("why", why);
-        self.tell_of_migration(self.kept.ledger.software.update.clone(), Some(reason));
+        self.tell_of_migration(self.memory.ledger.software.update.clone(), Some(reason));
     }
 
     /// What a committed update waits for.

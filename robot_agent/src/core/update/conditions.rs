@@ -135,7 +135,7 @@ impl AgentCore {
     /// The grant for that drain, if it was neither used nor came too late.
     pub(super) fn unused_grant(&self) -> Option<&ActivationGrant> {
         let drain_id = self.drain_to_activate_in()?;
-        let passed = self.kept.ledger.software.grant_id.max(self.update.stale_grant);
+        let passed = self.memory.ledger.software.grant_id.max(self.update.stale_grant);
         let grant = self.update.desired.as_ref()?.grant.as_ref();
         grant.filter(|grant| grant.drain_id == *drain_id && grant.grant_id > passed)
     }

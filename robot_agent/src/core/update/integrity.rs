@@ -63,11 +63,11 @@ impl AgentCore {
     }
 
     fn proven(&self) -> Proven {
-        self.kept.ledger.proven.as_deref().cloned().unwrap_or_default()
+        self.memory.ledger.proven.as_deref().cloned().unwrap_or_default()
     }
 
     fn put_proven(&mut self, proven: Proven) {
-        if self.kept.ledger.proven.as_deref() != Some(&proven) {
+        if self.memory.ledger.proven.as_deref() != Some(&proven) {
             self.write(Op::Proven(Arc::new(proven)), true);
         }
     }
@@ -92,7 +92,7 @@ impl AgentCore {
 
     /// A directive was taken by an agent that keeps documents.
     pub(super) fn note_directive(&mut self, generation: u64) {
-        if self.kept.ledger.proven.as_ref().map_or(0, |proven| proven.directive_generation) != generation {
+        if self.memory.ledger.proven.as_ref().map_or(0, |proven| proven.directive) != generation {
             let proven = self.proven();
             self.put_proven(Proven { directive_generation: generation, ..proven });
         }
@@ -101,11 +101,11 @@ impl AgentCore {
     /// What the disk says is held against the ledger: what an agent without documents did is taken over once, and what
     /// the switch record was about to say counts once it says so.
     pub(super) fn note_committed(&mut self, holdings: &Holdings) {
-        let software = &self.kept.ledger.software;
+        let software = &self.memory.ledger.software;
         let update = software.update.as_ref();
-        let is_older = match &self.kept.ledger.proven {
-            Some(proven) => software.directive_generation > proven.directive_generation,
-            None => software.directive_generation > 0 || update.is_some(),
+        let is_older = match &self.memory.ledger.proven {
+            Some(proven) => software.directive > proven.directive,
+            None => software.directive > 0 || update.is_some(),
         };
         let set = update.and_then(|u| u.set.clone());
         let mut proven = self.proven();
@@ -193,14 +193,14 @@ impl AgentCore {
 
     /// It is on trial, and the ledger knows of no such trial: the machine ends it.
     fn ends_anyway(&self, switch: &Switch) -> bool {
-        let update = self.kept.ledger.software.update.as_ref();
+        let update = self.memory.ledger.software.update.as_ref();
         let trial = switch.trial.as_ref().map(|trial| &trial.set);
         trial.is_some() && update.and_then(Update::set_name).as_ref() != trial
     }
 
     /// An update that has switched nothing yet keeps the machine from it: then it is ended here.
     fn end_beside_an_update(&mut self, holdings: &Holdings) -> Next {
-        let state = self.kept.ledger.software.update.as_ref().map(|u| u.state);
+        let state = self.memory.ledger.software.update.as_ref().map(|u| u.state);
         if !matches!(state, Some(UpdateState::Directed | UpdateState::Downloading | UpdateState::Staged)) {
             return Next::GoesOn;
         }
@@ -234,7 +234,7 @@ impl AgentCore {
     /// What runs holds. A robot that was stuck with it is so no more.
     fn acquit(&mut self) {
         self.update.standing = Standing::Holds;
-        let software = self.kept.ledger.software.clone();
+        let software = self.memory.ledger.software.clone();
         let is_ours = |u: &Update| u.reason.as_ref().is_some_and(|reason| reason.code == Code::RunningSetBad);
         let stuck = software.update.clone().filter(|u| u.state == UpdateState::Stuck && is_ours(u));
         let runs = self.update.holdings.as_ref().filter(|h| h.switch.trial.is_none()).map(|h| h.switch.current.clone());
@@ -246,7 +246,7 @@ impl AgentCore {
 
     /// Reads the next file of the set that runs, beside everything else.
     pub(super) fn check_files(&mut self, now: &Now, holdings: &Holdings) {
-        let state = self.kept.ledger.software.update.as_ref().map(|u| u.state);
+        let state = self.memory.ledger.software.update.as_ref().map(|u| u.state);
         let changes = matches!(
             state,
             Some(UpdateState::Switching | UpdateState::Committing | UpdateState::RollingBack | UpdateState::Stuck)
@@ -278,7 +278,7 @@ impl AgentCore {
     fn remedy(&mut self, now: &Now, holdings: &Holdings) -> Next {
         let Standing::Bad(bad) = &self.update.standing else { return Next::GoesOn };
         let (reason, is_given_up, is_mended) = (bad.reason.clone(), bad.is_given_up, bad.is_mended);
-        let update = self.kept.ledger.software.update.clone();
+        let update = self.memory.ledger.software.update.clone();
         let state = update.as_ref().map(|u| u.state);
         if let Some(update) = update.filter(|_| holdings.switch.trial.is_some()) {
             if matches!(update.state, UpdateState::Probation | UpdateState::Trial | UpdateState::Committing) {
@@ -346,7 +346,7 @@ impl AgentCore {
     /// Goes back from the committed set, or stays where it is without work.
     fn leave_committed(&mut self, holdings: &Holdings, reason: Reason) {
         let proven = self.proven();
-        let software = self.kept.ledger.software.clone();
+        let software = self.memory.ledger.software.clone();
         let is_committed = holdings.switch.current == proven.committed.current;
         let way_back =
             proven.way_back(&software.floors).filter(|way| holdings.switch.previous.as_deref() == Some(*way));

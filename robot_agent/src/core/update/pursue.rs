@@ -23,7 +23,7 @@ const LOOK_EVERY: LinkDuration = LinkDuration(60_000);
 impl AgentCore {
     /// Takes section `update` in.
     pub(crate) fn on_update(&mut self, desired: DesiredUpdate) {
-        let mut applied = self.kept.ledger.applied;
+        let mut applied = self.memory.ledger.applied;
         if desired.generation < applied.update {
             tracing::warn!(generation = desired.generation, applied = applied.update, "older update refused");
             return;
@@ -87,7 +87,7 @@ impl AgentCore {
 
     /// The next step of the update, or of the robot without one.
     fn pursue(&mut self, now: &Now, holdings: &Holdings) -> Option<ExitReason> {
-        let Some(update) = self.kept.ledger.software.update.clone() else { return self.settle(now, holdings) };
+        let Some(update) = self.memory.ledger.software.update.clone() else { return self.settle(now, holdings) };
         let case = Case { now, update: &update, holdings };
         let (condition, step) = machine::decide(update.state, |condition| self.holds(case, condition));
         self.take_step(case, condition, step)
@@ -102,7 +102,7 @@ impl AgentCore {
 
     /// No update, or one that is over: looks for a new directive, then tidies up.
     pub(super) fn settle(&mut self, now: &Now, holdings: &Holdings) -> Option<ExitReason> {
-        let update = self.kept.ledger.software.update.as_ref();
+        let update = self.memory.ledger.software.update.as_ref();
         let is_stuck = update.is_some_and(|u| u.state == UpdateState::Stuck);
         if !is_stuck && self.end_unknown_trial(&holdings.switch) {
             return None;
@@ -126,7 +126,7 @@ impl AgentCore {
 
     /// Content and sets that are needed beside those that the switch record names.
     fn needed(&self) -> BTreeSet<Digest> {
-        let update = self.kept.ledger.software.update.as_ref().filter(|u| !u.state.is_over());
+        let update = self.memory.ledger.software.update.as_ref().filter(|u| !u.state.is_over());
         let set = update.and_then(|u| u.set.as_ref());
         let mut needed: BTreeSet<Digest> =
             set.iter().flat_map(|set| set.components.values().map(|c| c.digest)).collect();

@@ -19,20 +19,20 @@ impl AgentCore {
 
     /// Moves the update on, on the ledger and in a report.
     pub(super) fn move_to(&mut self, state: UpdateState, reason: Option<Reason>) {
-        let Some(update) = self.kept.ledger.software.update.clone() else { return };
+        let Some(update) = self.memory.ledger.software.update.clone() else { return };
         let reason = reason.or(update.reason.clone());
         self.put_update(Update { state, reason, ..update });
     }
 
     pub(super) fn put_update(&mut self, update: Update) {
-        let from = self.kept.ledger.software.update.as_ref().filter(|u| u.bundle == update.bundle).map(|u| u.state);
+        let from = self.memory.ledger.software.update.as_ref().filter(|u| u.bundle == update.bundle).map(|u| u.state);
         if from.is_some_and(|from| from != update.state && !from.transitions().contains(&update.state)) {
             tracing::error!(?from, to = ?update.state, "no step of an update");
             return;
         }
         tracing::info!(robot_id = %self.config.robot_id, bundle = %update.bundle, state = ?update.state, reason = update.reason.as_ref().map(|reason| reason.name()), "update");
         self.update.collected = false;
-        self.put_software(SoftwareRow { update: Some(update), ..self.kept.ledger.software.clone() });
+        self.put_software(SoftwareRow { update: Some(update), ..self.memory.ledger.software.clone() });
         if let Some(report) = self.update_report() {
             self.emit(Lane::Event, RobotEvent::Update(UpdateEvent::Changed(report)));
         }
@@ -42,7 +42,7 @@ impl AgentCore {
     pub(crate) fn update_report(&self) -> Option<UpdateReport> {
         let (there, needed) = self.update.progress;
         let permille = there.saturating_mul(1000).checked_div(needed).unwrap_or(0);
-        self.kept.ledger.software.report(permille.min(1000) as u16)
+        self.memory.ledger.software.report(permille.min(1000) as u16)
     }
 
     pub(super) fn ask_for(&mut self, job: Job) {

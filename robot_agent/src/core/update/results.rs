@@ -101,13 +101,13 @@ impl AgentCore {
 
     /// What comes of the bundle on this robot, or why it does not fit.
     fn plan(&mut self, now: &Now, wanted: &Wanted, manifest: &Manifest, bytes: &[u8]) {
-        let Some(update) = self.kept.ledger.software.update.clone() else { return };
+        let Some(update) = self.memory.ledger.software.update.clone() else { return };
         let Some(holdings) = self.update.holdings.clone() else { return };
         let current = holdings.set(&holdings.switch.current).unwrap_or_default();
         let config = self.update.config.as_ref();
         let fit = Fit {
             model: self.inventory.model.clone(),
-            floors: self.kept.ledger.software.floors.clone(),
+            floors: self.memory.ledger.software.floors.clone(),
             floor: update.rollback_floor,
             allows_safety_related: config.is_some_and(|c| c.allows_safety_related),
             bugs: midshift_bundle::bugs::Bugs::default(),
@@ -155,7 +155,7 @@ impl AgentCore {
 
     /// A new base takes the slot of the set before, so the one that runs must have proved itself.
     fn may_take_base(&self, now: &Now, current: &SetManifest, set: &SetManifest) -> Result<(), Reason> {
-        let committed = self.kept.ledger.software.committed_at.filter(|_| set.changes_base(current));
+        let committed = self.memory.ledger.software.committed_at.filter(|_| set.changes_base(current));
         let Some(committed) = committed else { return Ok(()) };
         // A clock that went back says nothing of the time since.
         let kept_ms = if now.utc >= committed { now.utc.ms_since(committed) } else { 0 };
@@ -170,7 +170,7 @@ impl AgentCore {
         let switch = holdings.switch.clone();
         self.note_committed(&holdings);
         self.update.holdings = Some(holdings);
-        let Some(update) = self.kept.ledger.software.update.clone() else { return };
+        let Some(update) = self.memory.ledger.software.update.clone() else { return };
         let Some(name) = update.set_name() else { return };
         let runs = switch.trial.as_ref().is_some_and(|t| t.set == name);
         let fallen = switch.fallen.as_ref().filter(|f| f.set == name);

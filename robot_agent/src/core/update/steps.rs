@@ -113,7 +113,7 @@ impl AgentCore {
     fn begin_switch(&mut self, update: &Update) {
         let Some(grant) = self.unused_grant().cloned() else { return };
         self.update.granted_until = self.sent.ends(&grant.authority);
-        let row = SoftwareRow { grant_id: grant.grant_id, ..self.kept.ledger.software.clone() };
+        let row = SoftwareRow { grant_id: grant.grant_id, ..self.memory.ledger.software.clone() };
         self.put_software(row);
         let (state, drain_id) = (UpdateState::Switching, Some(grant.drain_id));
         self.put_update(Update { state, drain_id, reason: None, ..update.clone() });
@@ -135,7 +135,7 @@ impl AgentCore {
     fn commit(&mut self, case: Case<'_>) {
         let Case { now, update, holdings } = case;
         let kept = holdings.switch.kept().and_then(|kept| holdings.set(kept)).unwrap_or_default();
-        let mut row = SoftwareRow { committed_at: Some(now.utc), ..self.kept.ledger.software.clone() };
+        let mut row = SoftwareRow { committed_at: Some(now.utc), ..self.memory.ledger.software.clone() };
         if let Some(set) = update.set.as_ref().filter(|_| update.raises_floor) {
             row.floors = raised(&row.floors, set, &kept);
         }
@@ -148,8 +148,8 @@ impl AgentCore {
     }
 
     pub(super) fn go_back(&mut self, update: Update, reason: Reason) {
-        if update.state == UpdateState::Committed && !self.kept.ledger.software.due.is_empty() {
-            self.put_software(SoftwareRow { due: Vec::new(), ..self.kept.ledger.software.clone() });
+        if update.state == UpdateState::Committed && !self.memory.ledger.software.due.is_empty() {
+            self.put_software(SoftwareRow { due: Vec::new(), ..self.memory.ledger.software.clone() });
         }
         let drain_id = self.update.desired.as_ref().and_then(|d| d.drain_id.clone()).or(update.drain_id.clone());
         self.put_update(Update { state: UpdateState::RollingBack, drain_id, reason: Some(reason), ..update });

@@ -13,7 +13,7 @@ impl AgentCore {
     /// committed there too; any other is left for the one that was committed. True: a job is on its way.
     pub(super) fn end_unknown_trial(&mut self, switch: &Switch) -> bool {
         let Some(trial) = &switch.trial else { return false };
-        let update = self.kept.ledger.software.update.as_ref().filter(|u| u.state == UpdateState::Committed);
+        let update = self.memory.ledger.software.update.as_ref().filter(|u| u.state == UpdateState::Committed);
         let is_committed = update.and_then(Update::set_name).is_some_and(|name| name == trial.set);
         let mut switch = switch.clone();
         if is_committed {

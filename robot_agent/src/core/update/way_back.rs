@@ -21,7 +21,7 @@ impl AgentCore {
         if self.is_observed() || self.names(&desired) {
             return false;
         }
-        let software = self.kept.ledger.software.clone();
+        let software = self.memory.ledger.software.clone();
         let stuck = software.update.clone().filter(|update| update.state == UpdateState::Stuck);
         let is_back = stuck.as_ref().and_then(Update::set_name).is_some_and(|set| set != holdings.switch.running());
         if holdings.switch.kept().is_none() && !is_back {
