@@ -7,7 +7,7 @@ use midshift_core::time::{Clock, Utc};
 use midshift_identity::IdentityService;
 use midshift_ota::{OtaReader, OtaService};
 use midshift_sim::service::SimFace;
-use midshift_store::{FrameLog, HeardLog, Store};
+use midshift_store::{FrameLog, HeartbeatLog, Store};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
@@ -42,7 +42,7 @@ pub struct Components {
     /// Where STATUS is kept.
     pub frames: Arc<dyn FrameLog>,
     /// Where several processes share newest heartbeats, if the store is one for several.
-    pub heard: Option<Arc<dyn HeardLog>>,
+    pub heard: Option<Arc<dyn HeartbeatLog>>,
     /// The site.
     pub site: Arc<Site>,
     /// Its text.

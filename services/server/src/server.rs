@@ -381,7 +381,7 @@ async fn changed(watched: &mut Option<watch::Receiver<bool>>) -> bool {
 /// Reads what other gateways hear, if there may be any.
 async fn follow(parts: &Components, board: Arc<LiveBoard<Live>>) {
     match parts.heard.clone() {
-        Some(heard) => midshift_store::follow_heard(heard, board, parts.clock.clone()).await,
+        Some(heard) => midshift_store::follow_heartbeats(heard, board, parts.clock.clone()).await,
         None => std::future::pending().await,
     }
 }

@@ -5,8 +5,8 @@ use midshift_core::Boxed;
 use midshift_core::ids::SiteId;
 use midshift_core::time::Clock;
 use midshift_store::{
-    FRAME_BYTES_DEFAULT, FrameLog, HeardLog, Migrated, PostgresConfig, PostgresFrames, PostgresHeard, PostgresStore,
-    Road, SqliteFrames, SqliteStore, Store,
+    FRAME_BYTES_DEFAULT, FrameLog, HeartbeatLog, Migrated, PostgresConfig, PostgresFrames, PostgresHeartbeats,
+    PostgresStore, Road, SqliteFrames, SqliteStore, Store,
 };
 use std::path::Path;
 use std::sync::Arc;
@@ -62,8 +62,9 @@ impl Database {
                     let store = store.context("opening the store in PostgreSQL")?;
                     let frames = PostgresFrames::open(&config, site_id.clone(), clock, FRAME_BYTES_DEFAULT).await;
                     let frames = frames.context("opening the samples in PostgreSQL")?;
-                    let heard =
-                        PostgresHeard::open(&config, site_id).await.context("opening the heartbeats in PostgreSQL")?;
+                    let heard = PostgresHeartbeats::open(&config, site_id)
+                        .await
+                        .context("opening the heartbeats in PostgreSQL")?;
                     Ok(Storage::Postgres(Arc::new(store), Arc::new(frames), Arc::new(heard)))
                 }
                 None => {
@@ -95,7 +96,7 @@ pub enum Storage {
     /// Two files in the data directory.
     Sqlite(Arc<SqliteStore>, Arc<SqliteFrames>),
     /// Two schemas of a database.
-    Postgres(Arc<PostgresStore>, Arc<PostgresFrames>, Arc<PostgresHeard>),
+    Postgres(Arc<PostgresStore>, Arc<PostgresFrames>, Arc<PostgresHeartbeats>),
 }
 
 impl Storage {
@@ -116,7 +117,7 @@ impl Storage {
     }
 
     /// Where several processes share newest heartbeats; none where only one may open it.
-    pub fn heard(&self) -> Option<Arc<dyn HeardLog>> {
+    pub fn heard(&self) -> Option<Arc<dyn HeartbeatLog>> {
         match self {
             Self::Sqlite(..) => None,
             Self::Postgres(_, _, heard) => Some(heard.clone()),

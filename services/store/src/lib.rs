@@ -9,7 +9,7 @@
 //! 3. Nothing here decides about the fleet.
 //!
 //! Two things are not rows. Heartbeats and poses are volatile and stand on the [`LiveBoard`], which processes share
-//! through the [`HeardLog`]. Samples are bulky and stand in the [`FrameLog`].
+//! through the [`HeartbeatLog`]. Samples are bulky and stand in the [`FrameLog`].
 
 mod audit;
 mod board;
@@ -20,7 +20,7 @@ mod frames_pack;
 mod frames_queue;
 mod gather;
 mod group;
-mod heard;
+mod heartbeats;
 pub mod leadership;
 mod left_out;
 mod migrations;
@@ -39,13 +39,13 @@ pub use board::{Dirty, LiveBoard};
 pub use frames::{
     Coarsen, FRAME_BYTES_DEFAULT, Frame, FrameLog, FrameMark, FramesOldest, GAPS_MAX, Gap, MemoryFrames, StoredFrame,
 };
-pub use heard::{Heard, HeardLog, Kept, MemoryHeard, follow_heard};
+pub use heartbeats::{HeartbeatLog, MemoryHeartbeats, SavedHeartbeats, StoredHeartbeat, follow_heartbeats};
 pub use left_out::LeftOut;
 pub use migrations::Migrated;
 pub use model::MemoryStore;
 pub use open_error::OpenError;
 pub use postgres::{
-    CopiedSchema, PostgresConfig, PostgresCopy, PostgresFrames, PostgresHeard, PostgresRestore, PostgresStore,
+    CopiedSchema, PostgresConfig, PostgresCopy, PostgresFrames, PostgresHeartbeats, PostgresRestore, PostgresStore,
     RestoreError, Road, Wakes, migrate_postgres,
 };
 pub use projection::{Change, Fold, Projection};

@@ -9,7 +9,7 @@ use crate::registry::Registry;
 use crate::shared_heartbeats::Shared;
 use midshift_core::time::Clock;
 use midshift_core::work::Live;
-use midshift_store::{FrameLog, HeardLog, LiveBoard, Store};
+use midshift_store::{FrameLog, HeartbeatLog, LiveBoard, Store};
 use std::sync::Arc;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
@@ -23,7 +23,7 @@ pub struct Parts {
     /// Newest heartbeats, read by fleet.
     pub board: Arc<LiveBoard<Live>>,
     /// Where other processes read them, if any may open the store too.
-    pub heard: Option<Arc<dyn HeardLog>>,
+    pub heard: Option<Arc<dyn HeartbeatLog>>,
     /// Where the time of the wall, the link and the site is read.
     pub clock: Arc<dyn Clock>,
     /// Naive rules for twins of tests; none outside them.

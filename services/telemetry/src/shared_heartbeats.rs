@@ -7,7 +7,7 @@
 use crate::projection::LinkProjection;
 use midshift_core::ids::RobotId;
 use midshift_core::work::Live;
-use midshift_store::{Heard, HeardLog, Kept, LiveBoard};
+use midshift_store::{HeartbeatLog, LiveBoard, SavedHeartbeats, StoredHeartbeat};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -45,7 +45,7 @@ struct Waiting {
 
 /// The way from sessions to the log of heartbeats.
 pub struct Shared {
-    log: Arc<dyn HeardLog>,
+    log: Arc<dyn HeartbeatLog>,
     waiting: mpsc::Sender<Waiting>,
     queue: Mutex<Option<mpsc::Receiver<Waiting>>>,
     cut_off: watch::Sender<bool>,
@@ -53,7 +53,7 @@ pub struct Shared {
 
 impl Shared {
     /// Nothing is kept before [`keep_heartbeats`] runs.
-    pub fn new(log: Arc<dyn HeardLog>) -> Self {
+    pub fn new(log: Arc<dyn HeartbeatLog>) -> Self {
         let (waiting, queue) = mpsc::channel(WAITING_MAX);
         Self { log, waiting, queue: Mutex::new(Some(queue)), cut_off: watch::Sender::new(false) }
     }
@@ -79,13 +79,13 @@ pub async fn keep_heartbeats(shared: Option<&Shared>, board: &LiveBoard<Live>, p
     loop {
         let begun = Instant::now();
         let batch = gather(&mut queue).await;
-        let kept = tokio::time::timeout(KEEP_WITHIN, write(shared.log.as_ref(), &batch)).await;
-        match kept {
-            Ok(Ok(kept)) => {
+        let saved = tokio::time::timeout(KEEP_WITHIN, write(shared.log.as_ref(), &batch)).await;
+        match saved {
+            Ok(Ok(saved)) => {
                 reached = Instant::now();
                 shared.cut_off.send_if_modified(|cut_off| std::mem::replace(cut_off, false));
-                if let Some(kept) = kept {
-                    publish_kept(board, projection, batch, &kept).await;
+                if let Some(saved) = saved {
+                    publish_saved(board, projection, batch, &saved).await;
                 }
             }
             failed => {
@@ -119,24 +119,28 @@ async fn gather(queue: &mut mpsc::Receiver<Waiting>) -> BTreeMap<RobotId, Waitin
 }
 
 /// Keeps a batch; of an empty one only asks whether the log can be reached.
-async fn write(log: &dyn HeardLog, batch: &BTreeMap<RobotId, Waiting>) -> Result<Option<Kept>, midshift_store::Error> {
+async fn write(
+    log: &dyn HeartbeatLog,
+    batch: &BTreeMap<RobotId, Waiting>,
+) -> Result<Option<SavedHeartbeats>, midshift_store::Error> {
     if batch.is_empty() {
         return log.position().await.map(|_| None);
     }
     let begun = Instant::now();
-    let kept = log.keep_newest(batch.values().map(|waiting| Heard::from(waiting.live.as_ref())).collect()).await?;
+    let saved =
+        log.save_newest(batch.values().map(|waiting| StoredHeartbeat::from(waiting.live.as_ref())).collect()).await?;
     metrics::histogram!("midshift_telemetry_heartbeat_commit_seconds").record(begun.elapsed().as_secs_f64());
-    Ok(Some(kept))
+    Ok(Some(saved))
 }
 
 /// Puts what was kept on the board and tells its sessions, once what had been decided before has come down to them.
-async fn publish_kept(
+async fn publish_saved(
     board: &LiveBoard<Live>,
     projection: &LinkProjection,
     batch: BTreeMap<RobotId, Waiting>,
-    kept: &Kept,
+    saved: &SavedHeartbeats,
 ) {
-    let (fenced, heard): (Vec<_>, Vec<_>) = batch.into_values().partition(|w| kept.fenced.contains(&w.live.robot_id));
+    let (fenced, heard): (Vec<_>, Vec<_>) = batch.into_values().partition(|w| saved.fenced.contains(&w.live.robot_id));
     for waiting in &heard {
         board.publish(&waiting.live.robot_id, waiting.live.clone());
     }
@@ -144,7 +148,7 @@ async fn publish_kept(
         // A session that does not read has ended, or hears it with its next heartbeat.
         let _ = waiting.session.try_send(News::Fenced);
     }
-    let absorbed = projection.absorbed(kept.head);
+    let absorbed = projection.absorbed(saved.head);
     if tokio::time::timeout(PICTURE_WITHIN, absorbed).await.is_err() {
         tracing::warn!("heartbeats are not echoed: what was decided meanwhile cannot be read");
         return;

@@ -9,7 +9,7 @@ mod backup;
 mod connect;
 mod frames;
 mod frames_writer;
-mod heard;
+mod heartbeats;
 mod identity;
 mod migrate;
 mod read;
@@ -20,7 +20,7 @@ mod writer;
 pub use backup::{CopiedSchema, PostgresCopy, PostgresRestore, RestoreError};
 pub use connect::{PostgresConfig, Road, Wakes};
 pub use frames::PostgresFrames;
-pub use heard::PostgresHeard;
+pub use heartbeats::PostgresHeartbeats;
 
 use crate::migrations::{CONTROL, Migrated, TELEMETRY};
 use crate::queue::{PRUNE_SLICE, Queue, going, run, unavailable};

@@ -5,7 +5,7 @@
 //! committed. Nothing is remembered from one transaction to the next: other processes write too.
 
 use super::connect::{Database, WRITE_PATIENCE, is_gone, is_undone_by_others, no_answer};
-use super::heard::broken_silence;
+use super::heartbeats::broken_silence;
 use super::identity::identify;
 use super::write_sql;
 use crate::audit::Heads;

@@ -5,8 +5,8 @@ use crate::support::{at, clock, database, number, one, postgres_at, put, say, si
 use midshift_core::ids::RobotId;
 use midshift_core::rows::{Expect, Key, Log, Seq, Table, Writer};
 use midshift_store::{
-    CommitError, Frame, FrameLog, Gap, Heard, HeardLog, OpenError, PostgresConfig, PostgresCopy, PostgresFrames,
-    PostgresHeard, PostgresRestore, RestoreError, Store, StoreId, migrate_postgres,
+    CommitError, Frame, FrameLog, Gap, HeartbeatLog, OpenError, PostgresConfig, PostgresCopy, PostgresFrames,
+    PostgresHeartbeats, PostgresRestore, RestoreError, Store, StoreId, StoredHeartbeat, migrate_postgres,
 };
 use sqlx::{AssertSqlSafe, PgConnection, Row};
 use std::collections::BTreeMap;
@@ -83,8 +83,8 @@ pub async fn used() -> PostgresConfig {
         .report_gaps(vec![Gap { robot_id: robot(), ring, lane, from_seq: 1, to_seq: 2, reason, at_unix_ms: 3 }])
         .await
         .unwrap();
-    let heard = Heard { robot_id: robot(), session_epoch: 1, hb: 2, body: Arc::from("{}") };
-    PostgresHeard::open(&config, site()).await.unwrap().keep_newest(vec![heard]).await.unwrap();
+    let heard = StoredHeartbeat { robot_id: robot(), session_epoch: 1, hb: 2, body: Arc::from("{}") };
+    PostgresHeartbeats::open(&config, site()).await.unwrap().save_newest(vec![heard]).await.unwrap();
     config
 }
 
@@ -111,9 +111,12 @@ async fn a_database_made_of_a_copy_has_the_same_rows_and_goes_on_above_them_as_a
     frames.append(vec![frame(2)]).await.unwrap();
     let positions: Vec<u64> = frames.read(0, 1 << 20).await.unwrap().iter().map(|f| f.position).collect();
     assert_eq!(positions, [first, first + 1]);
-    let heard = PostgresHeard::open(&to, site()).await.unwrap();
+    let heard = PostgresHeartbeats::open(&to, site()).await.unwrap();
     let position = heard.position().await.unwrap();
-    heard.keep_newest(vec![Heard { robot_id: robot(), session_epoch: 1, hb: 3, body: Arc::from("{}") }]).await.unwrap();
+    heard
+        .save_newest(vec![StoredHeartbeat { robot_id: robot(), session_epoch: 1, hb: 3, body: Arc::from("{}") }])
+        .await
+        .unwrap();
     assert_eq!((position, heard.position().await.unwrap()), (1, 2));
 }
 

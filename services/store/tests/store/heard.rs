@@ -8,7 +8,8 @@ use midshift_core::robot::ReportedState;
 use midshift_core::rows::{Expect, Item, Seq, Silent, Table, Writer};
 use midshift_core::work::{ClockOffset, Live};
 use midshift_store::{
-    Applied, CommitError, Heard, HeardLog, LiveBoard, MemoryHeard, PostgresHeard, PostgresStore, Store, follow_heard,
+    Applied, CommitError, HeartbeatLog, LiveBoard, MemoryHeartbeats, PostgresHeartbeats, PostgresStore, Store,
+    StoredHeartbeat, follow_heartbeats,
 };
 use std::sync::Arc;
 use std::time::Duration;
@@ -19,14 +20,14 @@ fn robot(id: &str) -> RobotId {
     RobotId::parse(id).expect("a robot id")
 }
 
-fn heard(id: &str, session_epoch: u64, hb: u64) -> Heard {
-    Heard { robot_id: robot(id), session_epoch, hb, body: Arc::from(format!("{session_epoch}.{hb}")) }
+fn heard(id: &str, session_epoch: u64, hb: u64) -> StoredHeartbeat {
+    StoredHeartbeat { robot_id: robot(id), session_epoch, hb, body: Arc::from(format!("{session_epoch}.{hb}")) }
 }
 
-async fn contract(store: Arc<dyn Store>, log: &dyn HeardLog) {
+async fn contract(store: Arc<dyn Store>, log: &dyn HeartbeatLog) {
     assert_eq!(log.position().await.unwrap(), 0);
     assert_eq!(log.read(0).await.unwrap(), (Vec::new(), 0));
-    let kept = log.keep_newest(vec![heard("a", 2, 1), heard("b", 1, 7)]).await.unwrap();
+    let kept = log.save_newest(vec![heard("a", 2, 1), heard("b", 1, 7)]).await.unwrap();
     assert_eq!(kept.fenced, []);
     let first = log.position().await.unwrap();
     let (mut all, read) = log.read(0).await.unwrap();
@@ -34,31 +35,31 @@ async fn contract(store: Arc<dyn Store>, log: &dyn HeardLog) {
     assert_eq!((all, read), (vec![heard("a", 2, 1), heard("b", 1, 7)], first));
     assert_eq!(log.read(read).await.unwrap(), (Vec::new(), read));
     // Of an older session nothing is kept; others of the batch are.
-    let kept = log.keep_newest(vec![heard("a", 1, 99), heard("b", 1, 8)]).await.unwrap();
+    let kept = log.save_newest(vec![heard("a", 1, 99), heard("b", 1, 8)]).await.unwrap();
     assert_eq!(kept.fenced, [robot("a")]);
     let (newer, read) = log.read(read).await.unwrap();
     assert_eq!(newer, [heard("b", 1, 8)]);
     // Whoever was away sees each robot once, with its newest.
-    log.keep_newest(vec![heard("a", 2, 2)]).await.unwrap();
-    log.keep_newest(vec![heard("a", 3, 1)]).await.unwrap();
+    log.save_newest(vec![heard("a", 2, 2)]).await.unwrap();
+    log.save_newest(vec![heard("a", 3, 1)]).await.unwrap();
     assert_eq!(log.read(read).await.unwrap().0, [heard("a", 3, 1)]);
     // What was decided before is up to the head that it tells.
     let decided = store.commit(vec![item(Writer::Fleet, vec![put(Table::Attempt, "x", Expect::Absent, "{}")])]).await;
-    let kept = log.keep_newest(vec![heard("a", 3, 2)]).await.unwrap();
+    let kept = log.save_newest(vec![heard("a", 3, 2)]).await.unwrap();
     assert_eq!(kept.head, decided[0].as_ref().unwrap().seq);
 }
 
 #[tokio::test]
 async fn in_memory_newest_heartbeats_are_kept_and_read_as_the_contract_says() {
     let Bench { store, .. } = memory();
-    contract(store.clone(), &MemoryHeard::new(store)).await;
+    contract(store.clone(), &MemoryHeartbeats::new(store)).await;
 }
 
 #[tokio::test]
 async fn in_postgresql_newest_heartbeats_are_kept_and_read_as_the_contract_says() {
     let config = database().await;
     let store = Arc::new(postgres_at(&config).await);
-    let log = PostgresHeard::open(&config, site()).await.unwrap();
+    let log = PostgresHeartbeats::open(&config, site()).await.unwrap();
     contract(store, &log).await;
 }
 
@@ -72,14 +73,14 @@ async fn commit(store: &PostgresStore, id: &str, robot_id: &str, position: u64) 
 async fn what_relies_on_a_robots_silence_is_not_applied_once_it_was_heard_anywhere() {
     let config = database().await;
     let store = postgres_at(&config).await;
-    let log = PostgresHeard::open(&config, site()).await.unwrap();
+    let log = PostgresHeartbeats::open(&config, site()).await.unwrap();
     commit(&store, "never-heard", "a", 0).await.unwrap();
-    log.keep_newest(vec![heard("a", 1, 1)]).await.unwrap();
+    log.save_newest(vec![heard("a", 1, 1)]).await.unwrap();
     let known = log.position().await.unwrap();
     commit(&store, "known", "a", known).await.unwrap();
-    log.keep_newest(vec![heard("b", 1, 1)]).await.unwrap();
+    log.save_newest(vec![heard("b", 1, 1)]).await.unwrap();
     commit(&store, "another-robot", "a", known).await.unwrap();
-    log.keep_newest(vec![heard("a", 1, 2)]).await.unwrap();
+    log.save_newest(vec![heard("a", 1, 2)]).await.unwrap();
     let refused = commit(&store, "heard", "a", known).await.expect_err("it was heard");
     assert!(matches!(refused, CommitError::Heard { robot_id } if robot_id == robot("a")));
 }
@@ -88,7 +89,7 @@ async fn what_relies_on_a_robots_silence_is_not_applied_once_it_was_heard_anywhe
 async fn a_heartbeat_that_is_being_kept_is_waited_for_by_what_relies_on_silence() {
     let config = database().await;
     let store = Arc::new(postgres_at(&config).await);
-    let _log = PostgresHeard::open(&config, site()).await.unwrap();
+    let _log = PostgresHeartbeats::open(&config, site()).await.unwrap();
     let mut gateway = stranger(&config).await;
     say(&mut gateway, "BEGIN; UPDATE robot_last_head SET position = position + 1 WHERE site_id = 'north'").await;
     say(&mut gateway, "INSERT INTO robot_last VALUES ('north', 'a', 1, 1, 1, '')").await;
@@ -102,13 +103,13 @@ async fn a_heartbeat_that_is_being_kept_is_waited_for_by_what_relies_on_silence(
 async fn a_heartbeat_waits_for_what_relies_on_silence_and_tells_how_far_decisions_went() {
     let config = database().await;
     let store = postgres_at(&config).await;
-    let log = Arc::new(PostgresHeard::open(&config, site()).await.unwrap());
+    let log = Arc::new(PostgresHeartbeats::open(&config, site()).await.unwrap());
     let head = store.snapshot(&[]).await.unwrap().seq.0;
     let mut fleet = stranger(&config).await;
     say(&mut fleet, "BEGIN; SELECT seq FROM store_head WHERE site_id = 'north' FOR UPDATE").await;
     say(&mut fleet, "SELECT position FROM robot_last_head WHERE site_id = 'north' FOR SHARE").await;
     let keeping = log.clone();
-    let waiting = tokio::spawn(async move { keeping.keep_newest(vec![heard("a", 1, 1)]).await });
+    let waiting = tokio::spawn(async move { keeping.save_newest(vec![heard("a", 1, 1)]).await });
     until_a_writer_waits(&mut fleet).await;
     say(&mut fleet, &format!("UPDATE store_head SET seq = {}; COMMIT", head + 5)).await;
     assert_eq!(waiting.await.unwrap().unwrap().head, Seq(head + 5));
@@ -121,14 +122,14 @@ async fn two_gateways_that_keep_at_once_are_read_without_a_hole() {
     let _store = postgres_at(&config).await;
     let mut tasks = tokio::task::JoinSet::new();
     for gateway in ["a", "b"] {
-        let log = PostgresHeard::open(&config, site()).await.unwrap();
+        let log = PostgresHeartbeats::open(&config, site()).await.unwrap();
         tasks.spawn(async move {
             for hb in 1..=EACH {
-                assert_eq!(log.keep_newest(vec![heard(gateway, 1, hb)]).await.unwrap().fenced, []);
+                assert_eq!(log.save_newest(vec![heard(gateway, 1, hb)]).await.unwrap().fenced, []);
             }
         });
     }
-    let reader = PostgresHeard::open(&config, site()).await.unwrap();
+    let reader = PostgresHeartbeats::open(&config, site()).await.unwrap();
     let (mut position, mut newest) = (0, std::collections::BTreeMap::new());
     while newest.values().copied().sum::<u64>() < 2 * EACH {
         let (page, read) = reader.read(position).await.unwrap();
@@ -154,15 +155,15 @@ fn live(id: &str, hb: u64) -> Live {
 #[tokio::test(start_paused = true)]
 async fn what_a_gateway_keeps_comes_onto_the_boards_of_others_by_their_own_clocks() {
     let Bench { store, .. } = memory();
-    let log: Arc<dyn HeardLog> = Arc::new(MemoryHeard::new(store));
-    log.keep_newest(vec![Heard::from(&live("old", 1))]).await.unwrap();
+    let log: Arc<dyn HeartbeatLog> = Arc::new(MemoryHeartbeats::new(store));
+    log.save_newest(vec![StoredHeartbeat::from(&live("old", 1))]).await.unwrap();
     let board = LiveBoard::new();
-    let following = tokio::spawn(follow_heard(log.clone(), board.clone(), clock()));
+    let following = tokio::spawn(follow_heartbeats(log.clone(), board.clone(), clock()));
     let mut changed = board.changed();
     while board.read_up_to() == 0 {
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
-    log.keep_newest(vec![Heard::from(&live("a", 4))]).await.unwrap();
+    log.save_newest(vec![StoredHeartbeat::from(&live("a", 4))]).await.unwrap();
     changed.changed().await.unwrap();
     let seen = board.get(&robot("a")).expect("it is on the board");
     assert_eq!((seen.report.hb, seen.received_unix_ms, seen.clock), (4, 5, Some(OFFSET)));
@@ -170,7 +171,7 @@ async fn what_a_gateway_keeps_comes_onto_the_boards_of_others_by_their_own_clock
     assert!(board.get(&robot("old")).is_none(), "who was heard before is waited for");
     // What its own sessions put there is not replaced by what was read meanwhile.
     board.publish(&robot("a"), Arc::new(live("a", 9)));
-    log.keep_newest(vec![Heard::from(&live("a", 5)), Heard::from(&live("b", 1))]).await.unwrap();
+    log.save_newest(vec![StoredHeartbeat::from(&live("a", 5)), StoredHeartbeat::from(&live("b", 1))]).await.unwrap();
     while board.get(&robot("b")).is_none() {
         changed.changed().await.unwrap();
     }

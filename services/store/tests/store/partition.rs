@@ -4,7 +4,7 @@ use crate::line::{Line, Trap};
 use crate::server::PostgresServer;
 use crate::support::{database, one, postgres_at, put, say, site, stranger, until_a_writer_waits};
 use midshift_core::rows::{Expect, Key, Table, Writer};
-use midshift_store::{CommitError, HeardLog, PostgresConfig, PostgresHeard, Store};
+use midshift_store::{CommitError, HeartbeatLog, PostgresConfig, PostgresHeartbeats, Store};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -69,7 +69,7 @@ async fn reads_again_after(sever: fn(&Line)) {
     let config = database().await;
     let (line, far) = line_to(&config).await;
     let (cut_off, well) = (postgres_at(&far).await, postgres_at(&config).await);
-    let heard = PostgresHeard::open(&far, site()).await.unwrap();
+    let heard = PostgresHeartbeats::open(&far, site()).await.unwrap();
     one(&well, Writer::Fleet, vec![put(Table::Attempt, "a", Expect::Absent, "1")]).await.unwrap();
     let key = || vec![Key::new(Table::Attempt, "a")];
     tokio::join!(cut_off.get(key()), cut_off.get(key()), heard.position(), heard.position()).0.unwrap();

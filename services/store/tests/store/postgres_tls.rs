@@ -5,7 +5,7 @@ use crate::server::{PostgresServer, Proof};
 use crate::support::{clock, one, postgres_at, put, site};
 use midshift_core::rows::{Expect, Table, Writer};
 use midshift_store::{
-    OpenError, PostgresConfig, PostgresCopy, PostgresFrames, PostgresHeard, PostgresStore, Store, migrate_postgres,
+    OpenError, PostgresConfig, PostgresCopy, PostgresFrames, PostgresHeartbeats, PostgresStore, Store, migrate_postgres,
 };
 use rcgen::{
     BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
@@ -101,7 +101,7 @@ async fn everything_of_a_store_goes_over_tls_1_3_when_both_sides_prove_themselve
     migrate_postgres(&config).await.unwrap();
     let (writer, reader) = (postgres_at(&config).await, postgres_at(&config).await);
     let _frames = PostgresFrames::open(&config, site(), clock(), 1_000).await.unwrap();
-    let _heard = PostgresHeard::open(&config, site()).await.unwrap();
+    let _heard = PostgresHeartbeats::open(&config, site()).await.unwrap();
     let mut wake = reader.wake();
     let applied = one(&writer, Writer::Fleet, vec![put(Table::Attempt, "a", Expect::Absent, "{}")]).await.unwrap();
     wake.wait_for(|seq| *seq >= applied.seq).await.unwrap();

@@ -9,8 +9,8 @@ use midshift_core::time::Clock;
 use midshift_core::work::DesiredWork;
 use midshift_proto::session::CloseCode;
 use midshift_store::{
-    Error, FrameLog, Heard, HeardLog, Kept, LiveBoard, MemoryFrames, MemoryHeard, MemoryStore, Store, StoreId,
-    follow_heard,
+    Error, FrameLog, HeartbeatLog, LiveBoard, MemoryFrames, MemoryHeartbeats, MemoryStore, SavedHeartbeats, Store,
+    StoreId, StoredHeartbeat, follow_heartbeats,
 };
 use midshift_telemetry::{Bugs, Parts};
 use std::sync::Arc;
@@ -18,28 +18,28 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 /// The log in memory, behind a network that can be cut, and a fleet that decides at the last moment.
 struct Wire {
-    log: Arc<MemoryHeard>,
+    log: Arc<MemoryHeartbeats>,
     store: Arc<dyn Store>,
     is_cut: AtomicBool,
     decides: AtomicBool,
 }
 
 #[async_trait]
-impl HeardLog for Wire {
-    async fn keep_newest(&self, heard: Vec<Heard>) -> std::result::Result<Kept, Error> {
+impl HeartbeatLog for Wire {
+    async fn save_newest(&self, heard: Vec<StoredHeartbeat>) -> std::result::Result<SavedHeartbeats, Error> {
         self.reach()?;
         if self.decides.swap(false, Ordering::SeqCst) {
             let mut item = Item::new(Writer::Fleet, "fleet");
             item.put_row(&work(), Expect::Absent, "work.desired");
             assert!(self.store.commit(vec![item]).await.iter().all(std::result::Result::is_ok));
         }
-        self.log.keep_newest(heard).await
+        self.log.save_newest(heard).await
     }
     async fn position(&self) -> std::result::Result<u64, Error> {
         self.reach()?;
         self.log.position().await
     }
-    async fn read(&self, after: u64) -> std::result::Result<(Vec<Heard>, u64), Error> {
+    async fn read(&self, after: u64) -> std::result::Result<(Vec<StoredHeartbeat>, u64), Error> {
         self.reach()?;
         self.log.read(after).await
     }
@@ -72,7 +72,7 @@ struct Site {
     clock: Arc<dyn Clock>,
     store: Arc<dyn Store>,
     frames: Arc<dyn FrameLog>,
-    log: Arc<MemoryHeard>,
+    log: Arc<MemoryHeartbeats>,
 }
 
 impl Site {
@@ -80,7 +80,7 @@ impl Site {
         let clock = clock();
         let store: Arc<dyn Store> =
             Arc::new(MemoryStore::new(SiteId::parse("s")?, StoreId(Arc::from("store-1")), clock.clone()));
-        let log = Arc::new(MemoryHeard::new(store.clone()));
+        let log = Arc::new(MemoryHeartbeats::new(store.clone()));
         Ok(Self { frames: Arc::new(MemoryFrames::new(clock.clone(), 1 << 20)), clock, store, log })
     }
 
@@ -88,7 +88,7 @@ impl Site {
         let (is_cut, decides) = (AtomicBool::new(false), AtomicBool::new(false));
         let wire = Arc::new(Wire { log: self.log.clone(), store: self.store.clone(), is_cut, decides });
         let board = LiveBoard::new();
-        tokio::spawn(follow_heard(wire.clone(), board.clone(), self.clock.clone()));
+        tokio::spawn(follow_heartbeats(wire.clone(), board.clone(), self.clock.clone()));
         let parts = Parts {
             store: self.store.clone(),
             frames: self.frames.clone(),

@@ -1,6 +1,6 @@
-//! The newest heartbeat of each robot, where several processes must know it: gateways keep it, everybody reads what is new.
+//! Stores the newest heartbeat of each robot for several processes: gateways save it, and every process reads what is new.
 //!
-//! Invariant: what [`HeardLog::keep_newest`] has answered is what every later reader sees, and an item with
+//! Invariant: what [`HeartbeatLog::save_newest`] has answered is what every later reader sees, and an item with
 //! [`midshift_core::rows::Silent`] is applied only if nothing of its robot was kept after the position that it names. So whoever
 //! gives a robot's work to another knows everything that the robot relies on. Bodies are not decoded here.
 //!
@@ -20,9 +20,9 @@ use std::time::Duration;
 /// How often others' heartbeats are looked for: a tenth of the period in which robots send them.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 
-/// The newest heartbeat of one robot.
+/// The newest heartbeat of one robot, as it is stored.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Heard {
+pub struct StoredHeartbeat {
     /// The robot that sent it.
     pub robot_id: RobotId,
     /// Session that it came in.
@@ -33,9 +33,9 @@ pub struct Heard {
     pub body: Arc<str>,
 }
 
-/// What became of a call of [`HeardLog::keep_newest`].
+/// The answer of [`HeartbeatLog::save_newest`].
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Kept {
+pub struct SavedHeartbeats {
     /// Newest number of the store's feed at that moment: what was decided before is up to here.
     pub head: Seq,
     /// Robots of which a newer session has been heard already; theirs was not kept.
@@ -44,16 +44,16 @@ pub struct Kept {
 
 /// The log of newest heartbeats.
 #[async_trait]
-pub trait HeardLog: Send + Sync + 'static {
-    /// Keeps heartbeats of different robots, each unless a newer session of its robot was heard; durable on return.
-    async fn keep_newest(&self, heard: Vec<Heard>) -> Result<Kept, Error>;
+pub trait HeartbeatLog: Send + Sync + 'static {
+    /// Saves heartbeats of different robots, each unless a newer session of its robot was heard; durable on return.
+    async fn save_newest(&self, heard: Vec<StoredHeartbeat>) -> Result<SavedHeartbeats, Error>;
     /// The newest position; 0: nothing was ever kept.
     async fn position(&self) -> Result<u64, Error>;
     /// Robots heard after a position, each with its newest, and the position read up to.
-    async fn read(&self, after: u64) -> Result<(Vec<Heard>, u64), Error>;
+    async fn read(&self, after: u64) -> Result<(Vec<StoredHeartbeat>, u64), Error>;
 }
 
-impl From<&Live> for Heard {
+impl From<&Live> for StoredHeartbeat {
     fn from(live: &Live) -> Self {
         let (session_epoch, hb) = (live.report.session_epoch, live.report.hb);
         Self { robot_id: live.robot_id.clone(), session_epoch, hb, body: Told::from(live).text() }
@@ -62,7 +62,11 @@ impl From<&Live> for Heard {
 
 /// Brings what gateways hear onto the board of this process, until it is dropped. A heartbeat counts as processed when it is read, which is
 /// never before its gateway had it. What was heard before this began is passed over: whoever is there is heard again within a second.
-pub fn follow_heard(log: Arc<dyn HeardLog>, board: Arc<LiveBoard<Live>>, clock: Arc<dyn Clock>) -> Boxed<'static, ()> {
+pub fn follow_heartbeats(
+    log: Arc<dyn HeartbeatLog>,
+    board: Arc<LiveBoard<Live>>,
+    clock: Arc<dyn Clock>,
+) -> Boxed<'static, ()> {
     Box::pin(async move {
         let mut position = None;
         loop {
@@ -79,7 +83,7 @@ pub fn follow_heard(log: Arc<dyn HeardLog>, board: Arc<LiveBoard<Live>>, clock: 
 }
 
 async fn read_newest(
-    log: &dyn HeardLog,
+    log: &dyn HeartbeatLog,
     after: Option<u64>,
     board: &LiveBoard<Live>,
     clock: &dyn Clock,
@@ -103,8 +107,8 @@ async fn read_newest(
     Ok(position)
 }
 
-/// A [`HeardLog`] in memory, for several services over one store in one process.
-pub struct MemoryHeard {
+/// A [`HeartbeatLog`] in memory, for several services over one store in one process.
+pub struct MemoryHeartbeats {
     store: Arc<dyn Store>,
     state: Mutex<State>,
 }
@@ -112,10 +116,10 @@ pub struct MemoryHeard {
 #[derive(Default)]
 struct State {
     position: u64,
-    newest: BTreeMap<RobotId, (u64, Heard)>,
+    newest: BTreeMap<RobotId, (u64, StoredHeartbeat)>,
 }
 
-impl MemoryHeard {
+impl MemoryHeartbeats {
     /// An empty log beside `store`.
     pub fn new(store: Arc<dyn Store>) -> Self {
         Self { store, state: Mutex::default() }
@@ -123,8 +127,8 @@ impl MemoryHeard {
 }
 
 #[async_trait]
-impl HeardLog for MemoryHeard {
-    async fn keep_newest(&self, heard: Vec<Heard>) -> Result<Kept, Error> {
+impl HeartbeatLog for MemoryHeartbeats {
+    async fn save_newest(&self, heard: Vec<StoredHeartbeat>) -> Result<SavedHeartbeats, Error> {
         let mut fenced = Vec::new();
         {
             let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
@@ -138,14 +142,14 @@ impl HeardLog for MemoryHeard {
                 }
             }
         }
-        Ok(Kept { head: *self.store.wake().borrow(), fenced })
+        Ok(SavedHeartbeats { head: *self.store.wake().borrow(), fenced })
     }
 
     async fn position(&self) -> Result<u64, Error> {
         Ok(self.state.lock().unwrap_or_else(PoisonError::into_inner).position)
     }
 
-    async fn read(&self, after: u64) -> Result<(Vec<Heard>, u64), Error> {
+    async fn read(&self, after: u64) -> Result<(Vec<StoredHeartbeat>, u64), Error> {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let newer = state.newest.values().filter(|(position, _)| *position > after);
         Ok((newer.map(|(_, heard)| heard.clone()).collect(), state.position.max(after)))

@@ -10,7 +10,7 @@ use super::connect::{
 use super::migrate::BEGIN;
 use super::read;
 use crate::queue::unavailable;
-use crate::{Error, Heard, HeardLog, Kept, OpenError};
+use crate::{Error, HeartbeatLog, OpenError, SavedHeartbeats, StoredHeartbeat};
 use async_trait::async_trait;
 use midshift_core::Boxed;
 use midshift_core::ids::{RobotId, SiteId};
@@ -23,8 +23,8 @@ use tokio::sync::Mutex;
 /// How often a transaction is tried that the server undid because of others.
 const ATTEMPTS: u32 = 24;
 
-/// A [`HeardLog`] in schema `control` of a PostgreSQL database.
-pub struct PostgresHeard {
+/// A [`HeartbeatLog`] in schema `control` of a PostgreSQL database.
+pub struct PostgresHeartbeats {
     database: Database,
     site_id: SiteId,
     readers: PgPool,
@@ -32,7 +32,7 @@ pub struct PostgresHeard {
     writer: Mutex<Option<PgConnection>>,
 }
 
-impl PostgresHeard {
+impl PostgresHeartbeats {
     /// Opens it in a database whose store is open.
     ///
     /// # Errors
@@ -62,8 +62,8 @@ impl PostgresHeard {
 }
 
 #[async_trait]
-impl HeardLog for PostgresHeard {
-    async fn keep_newest(&self, heard: Vec<Heard>) -> Result<Kept, Error> {
+impl HeartbeatLog for PostgresHeartbeats {
+    async fn save_newest(&self, heard: Vec<StoredHeartbeat>) -> Result<SavedHeartbeats, Error> {
         let mut writer = self.writer.lock().await;
         let mut attempt = 0;
         loop {
@@ -72,7 +72,7 @@ impl HeardLog for PostgresHeard {
                 Some(connection) => connection,
                 None => self.database.writer().await.map_err(|error| Error::Unavailable(Arc::new(error)))?,
             };
-            let done = tokio::time::timeout(WRITE_PATIENCE, keep_batch(&mut connection, &self.site_id, &heard)).await;
+            let done = tokio::time::timeout(WRITE_PATIENCE, save_batch(&mut connection, &self.site_id, &heard)).await;
             match done.map_err(|_| Error::Unavailable(no_answer()))? {
                 Ok(kept) => {
                     *writer = Some(connection);
@@ -93,7 +93,7 @@ impl HeardLog for PostgresHeard {
         number(&row, 0).map_err(unavailable)
     }
 
-    async fn read(&self, after: u64) -> Result<(Vec<Heard>, u64), Error> {
+    async fn read(&self, after: u64) -> Result<(Vec<StoredHeartbeat>, u64), Error> {
         let select = sqlx::query(
             "SELECT position, robot_id, session_epoch, hb, body FROM robot_last \
              WHERE site_id = $1 AND position > $2 ORDER BY position",
@@ -101,7 +101,7 @@ impl HeardLog for PostgresHeard {
         let select = select.bind(self.site_id.as_str()).bind(after.cast_signed());
         let rows = patiently(async { select.fetch_all(&self.readers).await.map_err(unavailable) }).await?;
         let last = rows.last().map(|row| number(row, 0)).transpose().map_err(unavailable)?;
-        let heard: Result<Vec<Heard>, sqlx::Error> = rows.iter().map(decode).collect();
+        let heard: Result<Vec<StoredHeartbeat>, sqlx::Error> = rows.iter().map(decode).collect();
         Ok((heard.map_err(unavailable)?, last.unwrap_or(after)))
     }
 }
@@ -110,8 +110,8 @@ fn number(row: &sqlx::postgres::PgRow, at: usize) -> Result<u64, sqlx::Error> {
     row.try_get::<i64, _>(at).map(i64::cast_unsigned)
 }
 
-fn decode(row: &sqlx::postgres::PgRow) -> Result<Heard, sqlx::Error> {
-    Ok(Heard {
+fn decode(row: &sqlx::postgres::PgRow) -> Result<StoredHeartbeat, sqlx::Error> {
+    Ok(StoredHeartbeat {
         robot_id: robot_id(row.try_get(1)?)?,
         session_epoch: number(row, 2)?,
         hb: number(row, 3)?,
@@ -123,7 +123,11 @@ fn robot_id(text: &str) -> Result<RobotId, sqlx::Error> {
     RobotId::parse(text).map_err(|error| sqlx::Error::Decode(Box::new(error)))
 }
 
-async fn keep_batch(connection: &mut PgConnection, site_id: &SiteId, heard: &[Heard]) -> Result<Kept, sqlx::Error> {
+async fn save_batch(
+    connection: &mut PgConnection,
+    site_id: &SiteId,
+    heard: &[StoredHeartbeat],
+) -> Result<SavedHeartbeats, sqlx::Error> {
     sqlx::raw_sql(BEGIN).execute(&mut *connection).await?;
     let moved = sqlx::query("UPDATE robot_last_head SET position = position + 1 WHERE site_id = $1 RETURNING position")
         .bind(site_id.as_str())
@@ -149,7 +153,7 @@ async fn keep_batch(connection: &mut PgConnection, site_id: &SiteId, heard: &[He
     let head = read::head(&mut *connection, site_id).await?;
     sqlx::raw_sql("COMMIT").execute(connection).await?;
     let fenced = heard.iter().map(|h| &h.robot_id).filter(|id| !stored.contains(*id)).cloned().collect();
-    Ok(Kept { head, fenced })
+    Ok(SavedHeartbeats { head, fenced })
 }
 
 /// Which of the robots that had to be silent were heard after what was known of them. Until the transaction ends nobody else is kept.
