@@ -246,9 +246,9 @@ impl Live {
     }
 }
 
-/// A heartbeat as its gateway tells other processes: without the clocks of one of them.
+/// A heartbeat as its gateway shares it with other processes: without readings of clocks of one process.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Told {
+pub struct SharedHeartbeat {
     /// What the robot said.
     pub report: crate::robot::ReportedState,
     /// UTC of the gateway's wall at receipt, milliseconds.
@@ -257,12 +257,12 @@ pub struct Told {
     pub clock: Option<ClockOffset>,
 }
 
-impl Told {
-    /// As text, for [`Told::parse`].
+impl SharedHeartbeat {
+    /// As text, for [`SharedHeartbeat::parse`].
     pub fn text(&self) -> Arc<str> {
         written(self)
     }
-    /// From [`Told::text`].
+    /// From [`SharedHeartbeat::text`].
     ///
     /// # Errors
     /// If it is not such a text.
@@ -283,7 +283,7 @@ impl Told {
     }
 }
 
-impl From<&Live> for Told {
+impl From<&Live> for SharedHeartbeat {
     fn from(live: &Live) -> Self {
         Self { report: live.report.clone(), received_unix_ms: live.received_unix_ms, clock: live.clock }
     }

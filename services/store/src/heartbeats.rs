@@ -12,7 +12,7 @@ use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
 use midshift_core::rows::Seq;
 use midshift_core::time::Clock;
-use midshift_core::work::{Live, Told};
+use midshift_core::work::{Live, SharedHeartbeat};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -56,7 +56,7 @@ pub trait HeartbeatLog: Send + Sync + 'static {
 impl From<&Live> for StoredHeartbeat {
     fn from(live: &Live) -> Self {
         let (session_epoch, hb) = (live.report.session_epoch, live.report.hb);
-        Self { robot_id: live.robot_id.clone(), session_epoch, hb, body: Told::from(live).text() }
+        Self { robot_id: live.robot_id.clone(), session_epoch, hb, body: SharedHeartbeat::from(live).text() }
     }
 }
 
@@ -92,10 +92,10 @@ async fn read_newest(
     let (heard, position) = log.read(after).await?;
     let now = clock.now();
     for one in heard {
-        match Told::parse(&one.body) {
-            Ok(told) => {
+        match SharedHeartbeat::parse(&one.body) {
+            Ok(shared) => {
                 let before = board.get(&one.robot_id);
-                if let Some(live) = told.into_live(&one.robot_id, before.as_deref(), now) {
+                if let Some(live) = shared.into_live(&one.robot_id, before.as_deref(), now) {
                     board.publish(&one.robot_id, Arc::new(live));
                 }
             }
