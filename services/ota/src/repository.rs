@@ -16,7 +16,7 @@ pub(crate) use documents::every_second;
 pub use error::Error;
 pub use files::raise_floor;
 pub use keyless::{Keyless, SetLost};
-pub use newest::{By, Kept, Newest, Release};
+pub use newest::{By, Newest, Release, SignedDocument};
 pub use online::OnlineKeys;
 
 use crate::content::Content;
@@ -360,7 +360,13 @@ impl Repository {
     }
 
     /// Signs by the time at which it signs, not by the one at which somebody asked: the wall may have been wrong then.
-    fn sign(&self, before: Option<&Newest>, root: &Kept, targets: &[u8], asked: Utc) -> Result<(Online, Stamp), Error> {
+    fn sign(
+        &self,
+        before: Option<&Newest>,
+        root: &SignedDocument,
+        targets: &[u8],
+        asked: Utc,
+    ) -> Result<(Online, Stamp), Error> {
         let (snapshot, timestamp) = before.map_or((1, 1), |b| (b.stamp.snapshot_version + 1, b.stamp.version + 1));
         let versions = (snapshot.max(self.floor), timestamp.max(self.floor));
         let online = self.keys.sign(root, targets, versions, self.undoubted(asked)?)?;

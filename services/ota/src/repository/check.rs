@@ -3,7 +3,7 @@
 //! Invariant: nothing is written here, and all that is wrong with an offer is told at once as far as it can be known.
 
 use super::error::{Error, io};
-use super::newest::{Kept, Newest, Release};
+use super::newest::{Newest, Release, SignedDocument};
 use super::online::OnlineKeys;
 use crate::content::Content;
 use midshift_bundle::digest::Digest;
@@ -20,7 +20,7 @@ use std::path::Path;
 use tokio::io::AsyncReadExt;
 
 /// The newest root of a chain: each is the next after the one before, and signed by it.
-pub fn roots(before: Option<&Kept>, offered: &[Vec<u8>], now: Utc) -> Result<Kept, Error> {
+pub fn roots(before: Option<&SignedDocument>, offered: &[Vec<u8>], now: Utc) -> Result<SignedDocument, Error> {
     let mut bad = Violations::default();
     let mut newest = before.cloned();
     for (i, bytes) in offered.iter().enumerate() {
@@ -34,7 +34,7 @@ pub fn roots(before: Option<&Kept>, offered: &[Vec<u8>], now: Utc) -> Result<Kep
         }
         let signers = newest.as_ref().map_or(bytes, |root| &root.bytes);
         bad.accept(&field, check_root(signers, bytes));
-        newest = Some(Kept { bytes: bytes.clone(), edition });
+        newest = Some(SignedDocument { bytes: bytes.clone(), edition });
     }
     if newest.is_none() && bad.0.is_empty() {
         bad.add("roots", "the server has no root yet: the first publication brings all of them, from 1.root.json on");
@@ -47,7 +47,12 @@ pub fn roots(before: Option<&Kept>, offered: &[Vec<u8>], now: Utc) -> Result<Kep
 }
 
 /// The targets document that follows `before`, if `root` lets its signers sign.
-pub fn targets(root: &Kept, before: Option<&Kept>, offered: Vec<u8>, now: Utc) -> Result<Kept, Error> {
+pub fn targets(
+    root: &SignedDocument,
+    before: Option<&SignedDocument>,
+    offered: Vec<u8>,
+    now: Utc,
+) -> Result<SignedDocument, Error> {
     let mut bad = Violations::default();
     check_size(&mut bad, "targets", &offered);
     bad.accept("targets", check_targets(&root.bytes, &offered));
@@ -62,7 +67,7 @@ pub fn targets(root: &Kept, before: Option<&Kept>, offered: Vec<u8>, now: Utc) -
         bad.add("targets", format!("expired at {}", edition.expires.rfc3339()));
     }
     bad.finish()?;
-    Ok(Kept { edition: targets_edition(&offered)?, bytes: offered })
+    Ok(SignedDocument { edition: targets_edition(&offered)?, bytes: offered })
 }
 
 fn check_size(bad: &mut Violations, field: &str, document: &[u8]) {

@@ -11,7 +11,7 @@ use super::check;
 use super::error::Error;
 use super::files::{TIMESTAMP, file, read, read_by, read_seen};
 use super::keyless::SetLost;
-use super::newest::{By, Kept, Newest, Release};
+use super::newest::{By, Newest, Release, SignedDocument};
 use crate::content::Content;
 use crate::threads::blocking;
 use midshift_bundle::digest::Digest;
@@ -243,8 +243,8 @@ type Missed = BTreeMap<Digest, (String, Why)>;
 
 /// Documents that the timestamp of a folder leads to.
 struct Found {
-    root: Kept,
-    targets: Kept,
+    root: SignedDocument,
+    targets: SignedDocument,
     timestamp: Vec<u8>,
     stamp: Stamp,
     seen: BTreeMap<Digest, Utc>,
@@ -369,8 +369,8 @@ fn find(folder: &Path) -> Result<Option<Found>, Error> {
     }
     let root = root.ok_or_else(|| damaged(objection))?;
     Ok(Some(Found {
-        root: Kept { edition: root_edition(&root)?, bytes: root },
-        targets: Kept { edition: targets_edition(&targets)?, bytes: targets },
+        root: SignedDocument { edition: root_edition(&root)?, bytes: root },
+        targets: SignedDocument { edition: targets_edition(&targets)?, bytes: targets },
         timestamp: online.timestamp,
         stamp,
         seen: read_seen(folder)?,

@@ -12,9 +12,9 @@ use midshift_core::time::Utc;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// A document with its number and end.
+/// A signed document of the repository, with its number and end.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Kept {
+pub struct SignedDocument {
     /// As it was signed.
     pub bytes: Vec<u8>,
     /// Its number and end.
@@ -74,9 +74,9 @@ impl By {
 #[derive(Clone, Debug)]
 pub struct Newest {
     /// Who may sign.
-    pub root: Kept,
+    pub root: SignedDocument,
     /// Which files there are.
-    pub targets: Kept,
+    pub targets: SignedDocument,
     /// How fresh that is.
     pub stamp: Stamp,
     /// Files that may be handed out, by name.
@@ -99,8 +99,8 @@ pub struct Newest {
 impl Newest {
     /// What these documents say, without what is kept beside them.
     pub(super) fn new(
-        root: Kept,
-        targets: Kept,
+        root: SignedDocument,
+        targets: SignedDocument,
         stamp: Stamp,
         files: Vec<FileTarget>,
         releases: Vec<Release>,

@@ -4,7 +4,7 @@
 
 use super::error::{Error, io};
 use super::keyless::Keyless;
-use super::newest::{Kept, Newest};
+use super::newest::{Newest, SignedDocument};
 use midshift_bundle::freshness::{self, OnlineRole, check_online};
 use midshift_bundle::key_set::KeySet;
 use midshift_bundle::keys::SecretKey;
@@ -65,7 +65,13 @@ impl OnlineKeys {
     }
 
     /// Signs that `targets` is the newest, with the keys that `root` names, and holds the result against it.
-    pub(super) fn sign(&self, root: &Kept, targets: &[u8], versions: (u64, u64), now: Utc) -> Result<Online, Error> {
+    pub(super) fn sign(
+        &self,
+        root: &SignedDocument,
+        targets: &[u8],
+        versions: (u64, u64),
+        now: Utc,
+    ) -> Result<Online, Error> {
         let named = |keys: &'_ [SecretKey], role, name| -> Result<usize, Error> {
             for (index, key) in keys.iter().enumerate() {
                 if freshness::names(&root.bytes, role, &key.public())? {
