@@ -189,11 +189,12 @@ impl Marks {
 pub struct MemoryFrames {
     clock: Arc<dyn Clock>,
     bytes_max: u64,
-    state: Mutex<Kept>,
+    state: Mutex<FramesState>,
 }
 
+/// The frames in memory, with their marks and gaps.
 #[derive(Default)]
-struct Kept {
+struct FramesState {
     frames: VecDeque<StoredFrame>,
     bytes: u64,
     position: u64,
@@ -209,12 +210,12 @@ impl MemoryFrames {
         Self { clock, bytes_max, state: Mutex::default() }
     }
 
-    fn state(&self) -> MutexGuard<'_, Kept> {
+    fn state(&self) -> MutexGuard<'_, FramesState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Kept {
+impl FramesState {
     fn prune(&mut self, bytes_max: u64) -> u64 {
         let before = self.bytes;
         while self.bytes > bytes_max {

@@ -38,20 +38,20 @@ pub struct MemoryStore {
 struct State {
     head: Seq,
     tables: BTreeMap<Table, Rows>,
-    logs: [Kept; Log::ALL.len()],
+    logs: [MemoryLog; Log::ALL.len()],
     chains: Heads,
     growth: Growth,
 }
 
-/// What is left of one log.
+/// The entries of one log that were not pruned.
 #[derive(Default)]
-struct Kept {
+struct MemoryLog {
     entries: VecDeque<Entry>,
     /// Number of the newest entry that is gone.
     pruned: Seq,
 }
 
-impl Kept {
+impl MemoryLog {
     fn after(&self, after: Seq) -> impl Iterator<Item = &Entry> {
         self.entries.range(self.entries.partition_point(|e| e.seq <= after)..)
     }
