@@ -40,10 +40,10 @@ const FORMAT: u32 = 1;
 /// A file of a backup has at most so many bytes.
 const FILE_BYTES_MAX: u64 = 1 << 42;
 
-/// One file of a backup.
+/// The entry of one file in the list of a backup.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Kept {
+struct FileEntry {
     bytes: u64,
     sha256: String,
 }
@@ -62,7 +62,7 @@ struct List {
     /// Parts that are in it.
     parts: Vec<String>,
     /// Files by path.
-    files: BTreeMap<String, Kept>,
+    files: BTreeMap<String, FileEntry>,
 }
 
 /// What a backup holds, for people.
@@ -243,7 +243,7 @@ impl List {
 }
 
 /// Files of a folder by their path in it, all but the list.
-fn listed(root: &Path) -> anyhow::Result<BTreeMap<String, Kept>> {
+fn listed(root: &Path) -> anyhow::Result<BTreeMap<String, FileEntry>> {
     let mut found = BTreeMap::new();
     let mut folders = vec![root.to_owned()];
     while let Some(folder) = folders.pop() {
@@ -257,14 +257,14 @@ fn listed(root: &Path) -> anyhow::Result<BTreeMap<String, Kept>> {
             if inside != LIST {
                 let mut file = File::open(&path).with_context(|| format!("reading {}", path.display()))?;
                 let (digest, bytes) = Digest::of_reader(&mut file, FILE_BYTES_MAX)?;
-                found.insert(inside, Kept { bytes, sha256: digest.to_string() });
+                found.insert(inside, FileEntry { bytes, sha256: digest.to_string() });
             }
         }
     }
     Ok(found)
 }
 
-fn differences(list: &BTreeMap<String, Kept>, found: &BTreeMap<String, Kept>) -> Vec<String> {
+fn differences(list: &BTreeMap<String, FileEntry>, found: &BTreeMap<String, FileEntry>) -> Vec<String> {
     let missing = list.keys().filter(|path| !found.contains_key(*path)).map(|path| format!("{path} is missing"));
     let strange = found.keys().filter(|path| !list.contains_key(*path)).map(|path| format!("{path} is not listed"));
     let other = list.iter().filter(|(path, kept)| found.get(*path).is_some_and(|f| f != *kept));
