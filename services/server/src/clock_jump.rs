@@ -1,4 +1,4 @@
-//! What the wall clock of a server jumped at last, kept in its data folder: a server that was started again still tells of it.
+//! Saves the last jump of a server's wall clock in its data folder, so that the server still tells of it after a start.
 //!
 //! Invariant: it is told, and nothing else follows from it: durations, windows and certificates go by jumps of their own run. Whoever asks for the time
 //! does not wait for the disk.
@@ -17,8 +17,9 @@ const LOOK_EVERY: Duration = Duration::from_secs(2);
 /// Older ones are over: nobody looks into them any more. Milliseconds.
 const TOLD_MS: u64 = 24 * 3_600_000;
 
+/// The last jump of the wall clock, as the file has it.
 #[derive(Serialize, Deserialize)]
-struct Kept {
+struct SavedJump {
     /// Milliseconds ahead; negative: back.
     step_ms: i64,
     /// When it had, UTC of the wall, unix ms.
@@ -27,13 +28,13 @@ struct Kept {
 
 /// What the clock jumped at last before this run, and UTC when it had; none: nothing that is told.
 pub fn before(data: &Path, now: Utc) -> Option<(i64, Utc)> {
-    let kept: Kept = serde_json::from_slice(&fs::read(data.join(FILE)).ok()?).ok()?;
-    let to = Utc(kept.to_unix_ms);
-    (now.ms_since(to) <= TOLD_MS).then_some((kept.step_ms, to))
+    let saved: SavedJump = serde_json::from_slice(&fs::read(data.join(FILE)).ok()?).ok()?;
+    let to = Utc(saved.to_unix_ms);
+    (now.ms_since(to) <= TOLD_MS).then_some((saved.step_ms, to))
 }
 
-/// Keeps each jump of this run, until it is dropped.
-pub async fn keep_jumps(data: &Path, clock: &dyn Clock) {
+/// Saves each jump of the wall clock in this run, until it is dropped.
+pub async fn save_jumps(data: &Path, clock: &dyn Clock) {
     let mut known = None;
     loop {
         let seen = clock.last_jump();
@@ -48,8 +49,9 @@ pub async fn keep_jumps(data: &Path, clock: &dyn Clock) {
 }
 
 fn write(data: &Path, jump: &Jump) -> anyhow::Result<()> {
-    let (path, kept) = (data.join(FILE), Kept { step_ms: jump.step_ms(), to_unix_ms: jump.to.0 });
-    midshift_durable::replace(&path, &serde_json::to_vec(&kept)?).with_context(|| format!("writing {}", path.display()))
+    let (path, saved) = (data.join(FILE), SavedJump { step_ms: jump.step_ms(), to_unix_ms: jump.to.0 });
+    midshift_durable::replace(&path, &serde_json::to_vec(&saved)?)
+        .with_context(|| format!("writing {}", path.display()))
 }
 
 #[cfg(test)]
@@ -67,7 +69,7 @@ mod tests {
         let clock = WallClock::new(|| 0, move || Utc(wall.load(Relaxed)), |_: &Jump| {});
         let runs = async || {
             clock.now();
-            let _ = tokio::time::timeout(LOOK_EVERY * 2, keep_jumps(folder.path(), &clock)).await;
+            let _ = tokio::time::timeout(LOOK_EVERY * 2, save_jumps(folder.path(), &clock)).await;
         };
         runs().await;
         assert_eq!(before(folder.path(), began), None);
