@@ -184,7 +184,7 @@ fn run_once(run: Run<'_>) -> io::Result<Ending> {
         .stdout(Stdio::piped())
         .spawn();
     let mut child = match started {
-        Ok(child) => Kept(child),
+        Ok(child) => ChildGuard(child),
         Err(error) => {
             let how = format!("cannot be started: {error}");
             let is_environment = start_policy::is_of_environment(&error);
@@ -261,10 +261,10 @@ fn how_it_ended(status: ExitStatus) -> Ending {
     }
 }
 
-/// A child that never outlives this.
-struct Kept(Child);
+/// Kills its child process when it is dropped.
+struct ChildGuard(Child);
 
-impl Drop for Kept {
+impl Drop for ChildGuard {
     fn drop(&mut self) {
         // Already ended is what is wanted.
         let _ = self.0.kill();
