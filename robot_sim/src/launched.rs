@@ -25,16 +25,16 @@ use std::time::Duration;
 /// Bytes of software that one robot of a swarm keeps in memory: settings, not programs.
 pub const MEMORY_BYTES_MAX: u64 = 64 * 1024 * 1024;
 
-/// Where the sets of one robot are; a handle opens them as often as needed.
+/// Opens the sets of one robot, in memory or in a folder, as often as needed.
 #[derive(Clone, Debug)]
-enum Kept {
+enum SetStorage {
     Memory(MemorySets),
     Dir(PathBuf),
 }
 
 /// The launcher of one robot.
 pub struct Launched {
-    kept: Kept,
+    storage: SetStorage,
     tries: Arc<Mutex<Tries>>,
     /// What it does and says with what it came with.
     factory: (Behaviour, String),
@@ -56,7 +56,7 @@ fn lock(tries: &Mutex<Tries>) -> MutexGuard<'_, Tries> {
     tries.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-impl Kept {
+impl SetStorage {
     fn open(&self) -> Result<Box<dyn Sets>, sets::Error> {
         Ok(match self {
             Self::Memory(sets) => Box::new(sets.clone()),
@@ -68,17 +68,17 @@ impl Kept {
 impl Launched {
     /// For a robot whose sets are in the folder `dir`, or in memory; its body is as it came.
     pub fn new(dir: Option<&Path>, robot: &SimHandle) -> Self {
-        let kept = match dir {
-            Some(dir) => Kept::Dir(dir.to_owned()),
+        let storage = match dir {
+            Some(dir) => SetStorage::Dir(dir.to_owned()),
             None => {
                 let sets = MemorySets::new();
                 sets.limit(MEMORY_BYTES_MAX);
-                Kept::Memory(sets)
+                SetStorage::Memory(sets)
             }
         };
         let body = robot.lock();
         let (behaviour, version) = body.software();
-        Self { kept, tries: Arc::default(), factory: (behaviour.clone(), version.to_owned()) }
+        Self { storage, tries: Arc::default(), factory: (behaviour.clone(), version.to_owned()) }
     }
 
     /// Begins a start: counts it, and lets the body behave and call itself as the set that runs says.
@@ -86,7 +86,7 @@ impl Launched {
     /// # Errors
     /// Sets that cannot be read: nothing is started.
     pub fn start(&self, robot: &SimHandle, now: SiteTime) -> Result<Start, sets::Error> {
-        let mut sets = self.kept.open()?;
+        let mut sets = self.storage.open()?;
         let mut holdings = sets.holdings()?;
         let mut tries = lock(&self.tries);
         let tried = holdings.switch.running().to_owned();
@@ -132,7 +132,7 @@ impl Launched {
     /// Sets that cannot be opened.
     pub fn updates(&self, trust: &Trust, bulk: Bulk) -> Result<Updates, sets::Error> {
         let config = UpdateConfig { is_launched: true, ..trust.config() };
-        let worker = UpdateWorker::new(self.kept.open()?, Arc::new(GrpcRemote::new(bulk)));
+        let worker = UpdateWorker::new(self.storage.open()?, Arc::new(GrpcRemote::new(bulk)));
         Ok(Updates { config, worker: Box::new(worker) })
     }
 
@@ -141,7 +141,7 @@ impl Launched {
     /// # Errors
     /// Sets that cannot be read.
     pub fn holdings(&self) -> Result<Holdings, sets::Error> {
-        self.kept.open()?.holdings()
+        self.storage.open()?.holdings()
     }
 
     /// The set that runs has had its tries: one on trial is put away at the next start.
@@ -156,14 +156,14 @@ impl Launched {
 
     /// The power goes: what was not synced is gone. A folder on a real disk knows no such thing.
     pub fn lose_power(&self) {
-        if let Kept::Memory(sets) = &self.kept {
+        if let SetStorage::Memory(sets) = &self.storage {
             sets.lose_power();
         }
     }
 
     /// Hears the agent's pulse: one that runs well clears its tries.
     pub fn pulse(&self) -> Box<dyn FnMut() + Send> {
-        let (kept, tries) = (self.kept.clone(), self.tries.clone());
+        let (kept, tries) = (self.storage.clone(), self.tries.clone());
         let mut pulses = 0_u32;
         Box::new(move || {
             pulses = pulses.saturating_add(1);
