@@ -55,7 +55,7 @@ pub struct Trusted {
     targets: Option<String>,
     /// Lowest version of each role that may be believed.
     #[serde(deserialize_with = "known_roles")]
-    versions: BTreeMap<Kept, u64>,
+    versions: BTreeMap<VersionedRole, u64>,
     /// It is at least this late, UTC ms.
     time_floor: Utc,
     /// It is about this late, as the robot knows by itself; 0: it knows nothing.
@@ -66,17 +66,17 @@ pub struct Trusted {
     bugs: Bugs,
 }
 
-/// Roles whose versions are kept.
+/// A role whose versions may only rise.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-enum Kept {
+enum VersionedRole {
     Root,
     Timestamp,
     Snapshot,
     Targets,
 }
 
-impl Kept {
+impl VersionedRole {
     const ALL: [(Self, &'static str); 4] = [
         (Self::Root, "root"),
         (Self::Timestamp, "timestamp"),
@@ -86,13 +86,13 @@ impl Kept {
 }
 
 /// Whether versions of a role go on from one root to another: if its keys do.
-fn keeps(old: &Root, new: &Root) -> BTreeMap<Kept, bool> {
+fn keeps(old: &Root, new: &Root) -> BTreeMap<VersionedRole, bool> {
     let same = |role| role_keys(old, role) == role_keys(new, role);
     BTreeMap::from([
-        (Kept::Root, true),
-        (Kept::Timestamp, same(RoleType::Timestamp)),
-        (Kept::Snapshot, same(RoleType::Snapshot) && same(RoleType::Timestamp)),
-        (Kept::Targets, same(RoleType::Targets)),
+        (VersionedRole::Root, true),
+        (VersionedRole::Timestamp, same(RoleType::Timestamp)),
+        (VersionedRole::Snapshot, same(RoleType::Snapshot) && same(RoleType::Timestamp)),
+        (VersionedRole::Targets, same(RoleType::Targets)),
     ])
 }
 
@@ -106,9 +106,9 @@ fn shares_root_key(one: &Root, other: &Root) -> bool {
     role_keys(other, RoleType::Root).iter().any(|key| keys.contains(key))
 }
 
-fn known_roles<'de, D: Deserializer<'de>>(from: D) -> Result<BTreeMap<Kept, u64>, D::Error> {
+fn known_roles<'de, D: Deserializer<'de>>(from: D) -> Result<BTreeMap<VersionedRole, u64>, D::Error> {
     let mut named = BTreeMap::<String, u64>::deserialize(from)?;
-    Ok(Kept::ALL.into_iter().filter_map(|(role, name)| Some((role, named.remove(name)?))).collect())
+    Ok(VersionedRole::ALL.into_iter().filter_map(|(role, name)| Some((role, named.remove(name)?))).collect())
 }
 
 /// Why nothing new is believed.
@@ -213,7 +213,7 @@ impl Trusted {
             timestamp: None,
             snapshot: None,
             targets: None,
-            versions: BTreeMap::from([(Kept::Root, parsed.signed.version.get())]),
+            versions: BTreeMap::from([(VersionedRole::Root, parsed.signed.version.get())]),
             time_floor: Utc(0),
             own_time: Utc(0),
             bugs: Bugs::default(),
@@ -234,7 +234,7 @@ impl Trusted {
             return Ok(self.clone());
         }
         let keeps = keeps(&old, &new);
-        let kept = self.versions.iter().filter(|(role, _)| **role != Kept::Root && keeps[*role]);
+        let kept = self.versions.iter().filter(|(role, _)| **role != VersionedRole::Root && keeps[*role]);
         let versions = begun.versions.iter().chain(kept).map(|(role, version)| (*role, *version)).collect();
         Ok(Self { versions, time_floor: self.time_floor, bugs: self.bugs, ..begun })
     }
@@ -264,10 +264,10 @@ impl Trusted {
     pub fn time_floor(&self) -> Utc {
         self.time_floor
     }
-    /// As a server told the time over a connection on which it proved itself: the floor rises to that, at most to two days beyond the time of the newest signed
-    /// timestamp, and never falls. None: by less than an hour, or nothing signed has said any time yet.
+    /// Raises the time floor to the time that a proven server told, at most to two days beyond the time of the newest signed timestamp. It never
+    /// falls. None: it would rise by less than an hour, or nothing signed has said any time yet.
     #[must_use]
-    pub fn told(&self, time: Utc) -> Option<Self> {
+    pub fn raise_time_floor(&self, time: Utc) -> Option<Self> {
         let is_later = |floor: Utc| floor.0.saturating_sub(self.time_floor.0) >= TOLD_STEP_MS;
         if !is_later(time) {
             return None;
@@ -384,10 +384,10 @@ impl Trusted {
         let (snapshot, targets) = (repository.snapshot(), repository.targets());
         let keeps = keeps(&old, &root.signed);
         let offered = [
-            (Kept::Root, "root", root.signed.version.get(), root.signed.expires),
-            (Kept::Timestamp, "timestamp", timestamp.signed.version.get(), timestamp.signed.expires),
-            (Kept::Snapshot, "snapshot", snapshot.signed.version.get(), snapshot.signed.expires),
-            (Kept::Targets, "targets", targets.signed.version.get(), targets.signed.expires),
+            (VersionedRole::Root, "root", root.signed.version.get(), root.signed.expires),
+            (VersionedRole::Timestamp, "timestamp", timestamp.signed.version.get(), timestamp.signed.expires),
+            (VersionedRole::Snapshot, "snapshot", snapshot.signed.version.get(), snapshot.signed.expires),
+            (VersionedRole::Targets, "targets", targets.signed.version.get(), targets.signed.expires),
         ];
         let text = |name: String| heard.get(&name).map(|bytes| String::from_utf8_lossy(bytes).into_owned());
         let stamp = text("timestamp.json".to_owned());
@@ -441,17 +441,17 @@ impl Trusted {
             return None;
         }
         let keeps = keeps(&old, &newest);
-        let has_same = |document: &Option<String>, kept: Kept| document.clone().filter(|_| keeps[&kept]);
+        let has_same = |document: &Option<String>, kept: VersionedRole| document.clone().filter(|_| keeps[&kept]);
         let mut versions = self.versions.clone();
         versions.retain(|kept, _| keeps[kept]);
-        versions.insert(Kept::Root, newest.version.get());
+        versions.insert(VersionedRole::Root, newest.version.get());
         Some(Self {
             origin: self.origin,
             root: String::from_utf8_lossy(root).into_owned(),
             // It names a snapshot: it goes with that one.
-            timestamp: has_same(&self.timestamp, Kept::Snapshot),
-            snapshot: has_same(&self.snapshot, Kept::Snapshot),
-            targets: has_same(&self.targets, Kept::Targets),
+            timestamp: has_same(&self.timestamp, VersionedRole::Snapshot),
+            snapshot: has_same(&self.snapshot, VersionedRole::Snapshot),
+            targets: has_same(&self.targets, VersionedRole::Targets),
             versions,
             time_floor: self.time_floor,
             own_time: Utc(0),

@@ -228,23 +228,23 @@ async fn a_timestamp_that_is_withheld_is_seen_to_expire_by_the_time_that_a_prove
     let unsynced = Reading { utc: Utc(0), is_synced: false };
     let shown = async |robot: &Trusted| robot.refresh(Arc::new(shelf.documents.clone()), unsynced).await;
     assert!(shown(&robot).await.is_ok(), "by itself it cannot know that a day has passed");
-    assert_eq!(robot.told(shelf.now), None);
-    assert_eq!(robot.told(shelf.now.plus_ms(DAY_MS / 48)), None, "not worth a write");
-    let later = robot.told(shelf.now.plus_ms(DAY_MS + DAY_MS / 2)).expect("a later time");
+    assert_eq!(robot.raise_time_floor(shelf.now), None);
+    assert_eq!(robot.raise_time_floor(shelf.now.plus_ms(DAY_MS / 48)), None, "not worth a write");
+    let later = robot.raise_time_floor(shelf.now.plus_ms(DAY_MS + DAY_MS / 2)).expect("a later time");
     let error = shown(&later).await.expect_err("the timestamp lived a day");
     assert!(matches!(error, Error::Expired { role: "timestamp", .. }), "{error}");
-    assert_eq!(later.told(shelf.now.plus_ms(DAY_MS)), None, "it never falls");
+    assert_eq!(later.raise_time_floor(shelf.now.plus_ms(DAY_MS)), None, "it never falls");
     // A server that is ten years ahead moves it by two days, and then no further.
-    let ahead = robot.told(shelf.now.plus_ms(3_650 * DAY_MS)).expect("a later time");
+    let ahead = robot.raise_time_floor(shelf.now.plus_ms(3_650 * DAY_MS)).expect("a later time");
     assert_eq!(ahead.time_floor(), shelf.now.plus_ms(2 * DAY_MS));
-    assert_eq!(ahead.told(shelf.now.plus_ms(3_651 * DAY_MS)), None);
+    assert_eq!(ahead.raise_time_floor(shelf.now.plus_ms(3_651 * DAY_MS)), None);
     let mut signed = shelf.clone();
     signed.now = shelf.now.plus_ms(3 * DAY_MS);
     signed.freshen();
     let healed = signed.shown_to(&ahead).await.expect("what is signed after that is believed").trusted;
     assert_eq!(healed.time_floor(), signed.now);
     assert!(
-        Trusted::new(&shelf.documents.0["1.root.json"]).expect("a root").told(shelf.now).is_none(),
+        Trusted::new(&shelf.documents.0["1.root.json"]).expect("a root").raise_time_floor(shelf.now).is_none(),
         "no signed time"
     );
 }

@@ -57,7 +57,7 @@ impl Site {
     /// What a robot believes once it was told the time by an echo, as far as the server stands by it, and asked; its clock is set, or not.
     async fn shown_to(&self, robot: &Trusted, clock: Reading) -> Result<Trusted, trust::Error> {
         let own = &self.opened().clock;
-        let told = if own.doubt().is_some() { None } else { robot.told(own.now().wall) };
+        let told = if own.doubt().is_some() { None } else { robot.raise_time_floor(own.now().wall) };
         let source = Arc::new(Shown(self.service.clone()));
         told.as_ref().unwrap_or(robot).refresh(source, clock).await.map(|refreshed| refreshed.trusted)
     }
@@ -114,7 +114,7 @@ async fn a_wall_that_was_thirty_days_ahead_for_a_minute_stops_no_update_afterwar
     let error = site.publish(&first, "1.1.0", 1).await.expect_err("nor is a release");
     assert!(matches!(error, Error::Clock(doubt) if doubt.step_ms == MONTH_MS), "{error}");
     assert_eq!(site.opened().repository.directive_key().err(), Some(Keyless::Clock));
-    let naive = robots[1].told(site.opened().now()).expect("one that goes by any echo");
+    let naive = robots[1].raise_time_floor(site.opened().now()).expect("one that goes by any echo");
     site.pass(MINUTE_MS).await;
     let later = START.plus_ms(MINUTE_MS);
     for (robot, clock) in robots.iter_mut().zip([set(later), unset]) {

@@ -77,7 +77,7 @@ impl AgentCore {
             return;
         }
         self.update.told = Some(time);
-        if let Some(trusted) = self.memory.ledger.trusted.as_ref().and_then(|trusted| trusted.told(time)) {
+        if let Some(trusted) = self.memory.ledger.trusted.as_ref().and_then(|trusted| trusted.raise_time_floor(time)) {
             self.write(Op::Trusted(Arc::new(trusted)), false);
         }
     }
@@ -145,7 +145,7 @@ impl AgentCore {
     /// The repository has answered: what it says is believed first, then the directive is held against it.
     pub(super) fn refreshed(&mut self, now: &Now, mut refreshed: Refreshed, key_sets: &BTreeMap<u64, Vec<u8>>) {
         // What it was told meanwhile counts beside what was signed.
-        if let Some(later) = self.update.told.and_then(|time| refreshed.trusted.told(time)) {
+        if let Some(later) = self.update.told.and_then(|time| refreshed.trusted.raise_time_floor(time)) {
             refreshed.trusted = later;
         }
         self.write(Op::Trusted(Arc::new(refreshed.trusted.clone())), true);
