@@ -11,9 +11,9 @@ use crate::rows::{BadRow, Key, Revision, Row, Table};
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// What is known of one row kept aside.
+/// What can be read of one row that is kept aside.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Kept {
+struct UnknownRow {
     revision: Revision,
     reason: Reason,
     robots: BTreeSet<RobotId>,
@@ -24,21 +24,21 @@ struct Kept {
 
 /// Rows kept aside, by key.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct UnknownRows(BTreeMap<Key, Kept>);
+pub struct UnknownRows(BTreeMap<Key, UnknownRow>);
 
 impl UnknownRows {
     /// Keeps a row aside that could not be read for this reason.
     pub(crate) fn keep_aside(&mut self, row: &Row, error: &BadRow) {
         let name = format!("{}/{}", row.key.table.name(), row.key.id);
         let body = serde_json::from_str(&row.body).unwrap_or_default();
-        let kept = Kept {
+        let unknown = UnknownRow {
             revision: row.revision,
             reason: Reason::from(Code::RowUnknown).with("row", name).with("value", error.value()),
             robots: robots_of(&row.key, &body),
             tasks: tasks_of(&row.key, &body),
             is_untold: true,
         };
-        self.0.insert(row.key.clone(), kept);
+        self.0.insert(row.key.clone(), unknown);
     }
     /// The row can be read again, or is gone.
     pub(crate) fn forget(&mut self, key: &Key) {
@@ -46,35 +46,35 @@ impl UnknownRows {
     }
     /// Whether the row is aside as of this revision or a newer one.
     pub(crate) fn has(&self, key: &Key, revision: Revision) -> bool {
-        self.0.get(key).is_some_and(|kept| kept.revision >= revision)
+        self.0.get(key).is_some_and(|unknown| unknown.revision >= revision)
     }
     /// Why nothing is decided that touches these rows; none: none of them is aside.
     pub fn refusal_of<'a>(&self, mut keys: impl Iterator<Item = &'a Key>) -> Option<&Reason> {
         if self.0.is_empty() {
             return None;
         }
-        keys.find_map(|key| self.0.get(key)).map(|kept| &kept.reason)
+        keys.find_map(|key| self.0.get(key)).map(|unknown| &unknown.reason)
     }
-    /// Keeps work from a robot that a row aside is about. A stop or a rule of an area that cannot be read is about all of them.
+    /// Checks that no row aside is about this robot. A stop or a rule of an area that cannot be read is about all robots.
     ///
     /// # Errors
     /// If there is one; the reason names it.
-    pub fn screen(&self, robot_id: &RobotId) -> Result<(), Reason> {
-        let is_about = |key: &Key, kept: &Kept| {
-            kept.robots.contains(robot_id) || matches!(key.table, Table::StopRecord | Table::AreaPolicy)
+    pub fn check_robot(&self, robot_id: &RobotId) -> Result<(), Reason> {
+        let is_about = |key: &Key, unknown: &UnknownRow| {
+            unknown.robots.contains(robot_id) || matches!(key.table, Table::StopRecord | Table::AreaPolicy)
         };
-        match self.0.iter().find(|(key, kept)| is_about(key, kept)) {
-            Some((_, kept)) => Err(kept.reason.clone()),
+        match self.0.iter().find(|(key, unknown)| is_about(key, unknown)) {
+            Some((_, unknown)) => Err(unknown.reason.clone()),
             None => Ok(()),
         }
     }
     /// Whether a row aside is about this robot alone.
     pub fn names(&self, robot_id: &RobotId) -> bool {
-        self.0.values().any(|kept| kept.robots.contains(robot_id))
+        self.0.values().any(|unknown| unknown.robots.contains(robot_id))
     }
     /// Why a task is not acted on; none: no row aside is about it.
     pub fn of_task(&self, task_id: &TaskId) -> Option<&Reason> {
-        self.0.values().find(|kept| kept.tasks.contains(task_id)).map(|kept| &kept.reason)
+        self.0.values().find(|unknown| unknown.tasks.contains(task_id)).map(|unknown| &unknown.reason)
     }
     /// Whether the row of a place is aside.
     pub fn is_place_aside(&self, place_id: &PlaceId) -> bool {
@@ -82,8 +82,9 @@ impl UnknownRows {
     }
     /// What no person was told of yet, each once, with a robot that it is about.
     pub fn take_untold(&mut self) -> Vec<(Reason, Option<RobotId>)> {
-        let untold = self.0.values_mut().filter_map(|kept| std::mem::take(&mut kept.is_untold).then_some(kept));
-        untold.map(|kept| (kept.reason.clone(), kept.robots.first().cloned())).collect()
+        let untold =
+            self.0.values_mut().filter_map(|unknown| std::mem::take(&mut unknown.is_untold).then_some(unknown));
+        untold.map(|unknown| (unknown.reason.clone(), unknown.robots.first().cloned())).collect()
     }
 }
 

@@ -169,7 +169,7 @@ pub fn robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotI
     if !view.unknown_rows.names(robot_id) && refused.is_none() {
         view.sessions.get(robot_id.as_str())?;
     }
-    if let Err(unread) = view.unknown_rows.screen(robot_id) {
+    if let Err(unread) = view.unknown_rows.check_robot(robot_id) {
         let verdict = Some(standing::about_robot(unread, robot_id));
         return Some(RobotExplanation { verdict, candidates: Vec::new() });
     }
