@@ -34,11 +34,11 @@ pub fn robot(view: &FleetProjection, board: &Board, robot_id: &RobotId, now: &No
         Presence::Offline => return Err(Code::RobotOffline.into()),
     }
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
-    engaged_stops::screen(view, robot_id, Some(live))?;
+    engaged_stops::check_stops(view, robot_id, Some(live))?;
     decided_by_people(view, robot_id, Some(live))?;
     reported(live)?;
     plausible::keeps_back(view, live)?;
-    disbelief::screen(view, robot_id)?;
+    disbelief::check_believed(view, robot_id)?;
     if let Some(why) = maps::differs(view, live) {
         return Err(why);
     }
@@ -61,7 +61,7 @@ pub fn robot(view: &FleetProjection, board: &Board, robot_id: &RobotId, now: &No
     if !current {
         return Err(Code::RobotReconciling.into());
     }
-    answers::screen(view, robot_id, now)?;
+    answers::check_answering(view, robot_id, now)?;
     if routing::find(view, live.report.vitals.waypoint.as_ref()).is_none() {
         return Err(Code::RobotUnlocated.into());
     }

@@ -78,9 +78,9 @@ mod tests {
         let (mut view, now, mut plan) = (view(), Now::default(), Plan::default());
         assert!(!plan.decide(&mut view, now, "tests", too_much));
         assert!(view.holds.is_empty() && view.authority.is_empty() && plan.items.is_empty());
-        assert_eq!(view.refused.screen(&robot()), Ok(()));
+        assert_eq!(view.refused.check_robot(&robot()), Ok(()));
         assert!(!plan.decide(&mut view, now, "tests", too_much));
-        let why = view.refused.screen(&robot()).expect_err("it gets no work");
+        let why = view.refused.check_robot(&robot()).expect_err("it gets no work");
         assert_eq!(why.code, Code::DecisionPutAside);
         open_put_aside(&mut view, now, &mut plan);
         open_put_aside(&mut view, now, &mut plan);

@@ -185,7 +185,7 @@ fn check_goes_on(view: &FleetProjection, board: &Board, now: &Now, robot_id: &Ro
         Presence::Offline => return Err(Code::RobotOffline.into()),
     }
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
-    engaged_stops::screen(view, robot_id, Some(live))?;
+    engaged_stops::check_stops(view, robot_id, Some(live))?;
     if let Some(hold) = view.robot_holds(robot_id).next() {
         return Err(robot_held(&hold.token, robot_id));
     }

@@ -111,11 +111,11 @@ pub fn answered(tx: &mut Tx, robot_id: &RobotId) {
     }
 }
 
-/// Keeps work from a robot that does not answer, until its next probe is due.
+/// Checks that a robot answers offers, or that its next probe is due.
 ///
 /// # Errors
-/// If so.
-pub fn screen(view: &FleetProjection, robot_id: &RobotId, now: &Now) -> Result<(), Reason> {
+/// If it does not answer.
+pub fn check_answering(view: &FleetProjection, robot_id: &RobotId, now: &Now) -> Result<(), Reason> {
     let since = view.control.get(robot_id.as_str()).and_then(|c| c.row.unanswered_since);
     if let Some(since) = since.filter(|since| now.ms_since(*since) < limits::BREAKER_WINDOW.as_ms()) {
         let left_ms = limits::BREAKER_WINDOW.as_ms() - now.ms_since(since);
@@ -155,7 +155,7 @@ mod tests {
     }
 
     fn code(view: &FleetProjection, n: usize, secs: u64) -> Option<Code> {
-        screen(view, &robot(n), &at(secs)).err().map(|reason| reason.code)
+        check_answering(view, &robot(n), &at(secs)).err().map(|reason| reason.code)
     }
 
     #[test]

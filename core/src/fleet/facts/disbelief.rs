@@ -22,13 +22,13 @@ pub fn disbelieve(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, place
     let fault = Some(Fault { code: FAULT_DISBELIEVED, class: FaultClass::Mechanical, message });
     // Of its word counts what it adds, and no step.
     let report = AttemptReport { step_index, fault, ..report.clone() };
-    let why = told(tx.view, robot_id, &report, task_id, place_id);
+    let why = explain_disbelief(tx.view, robot_id, &report, task_id, place_id);
     incidents::open_as(tx, incident_of(robot_id), why.clone(), Some(robot_id), Some(task_id));
     apply_event(tx, task_id, News { event: Event::FailedFinal, why: Some(&why), report: Some(&report) });
     transitions::release(tx, robot_id, &report);
 }
 
-fn told(
+fn explain_disbelief(
     view: &FleetProjection,
     robot_id: &RobotId,
     report: &AttemptReport,
@@ -54,11 +54,11 @@ fn incident_of(robot_id: &RobotId) -> String {
     format!("{}:{robot_id}", Code::GoalNotEntered)
 }
 
-/// Keeps work from a robot whose word was not believed and that nobody has looked at.
+/// Checks that a robot was believed, or that a person has looked at it since.
 ///
 /// # Errors
-/// If so; the reason says what it said.
-pub fn screen(view: &FleetProjection, robot_id: &RobotId) -> Result<(), Reason> {
+/// If neither; the reason says what the robot said.
+pub fn check_believed(view: &FleetProjection, robot_id: &RobotId) -> Result<(), Reason> {
     let incident = view.incidents.get(&incident_of(robot_id)).map(|i| &i.row);
     match incident.filter(|i| i.closed.is_none()) {
         Some(open) => Err(open.reason.clone()),

@@ -39,11 +39,11 @@ impl Refused {
     pub fn is_aside(&self, outline: &Outline) -> bool {
         self.known.get(outline).is_some_and(|known| known.is_aside)
     }
-    /// Keeps work from a robot that a decision aside is about.
+    /// Checks that no decision aside is about a robot.
     ///
     /// # Errors
     /// If there is one; the reason names it.
-    pub fn screen(&self, robot_id: &RobotId) -> Result<(), Reason> {
+    pub fn check_robot(&self, robot_id: &RobotId) -> Result<(), Reason> {
         match self.aside().find(|(_, known)| known.robots.contains(robot_id)) {
             Some((outline, _)) => Err(reason(outline)),
             None => Ok(()),

@@ -105,7 +105,7 @@ pub fn doubtful(view: &FleetProjection, live: &Live) -> Option<(AttemptId, Reaso
 /// If so; the reason says what.
 pub fn keeps_back(view: &FleetProjection, live: &Live) -> Result<(), Reason> {
     view.unknown_rows.check_robot(&live.robot_id)?;
-    view.refused.screen(&live.robot_id)?;
+    view.refused.check_robot(&live.robot_id)?;
     match doubtful(view, live).map(|(_, why)| why).or_else(|| claims::too_many(view, live)) {
         Some(why) => Err(why),
         None => Ok(()),

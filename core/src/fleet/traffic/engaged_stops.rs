@@ -29,8 +29,12 @@ pub(in crate::fleet) fn over<'v>(
     standing(view).filter(move |stop| stop.includes(robot_id, pose))
 }
 
-/// Whether a stop keeps work from the robot, also before its token is written.
-pub(in crate::fleet) fn screen(view: &FleetProjection, robot_id: &RobotId, live: Option<&Live>) -> Result<(), Reason> {
+/// Checks that no stop keeps work from the robot, also before its token is written.
+pub(in crate::fleet) fn check_stops(
+    view: &FleetProjection,
+    robot_id: &RobotId,
+    live: Option<&Live>,
+) -> Result<(), Reason> {
     match over(view, robot_id, live).next() {
         Some(stop) => Err(Reason::from(Code::StopEngaged).with("stop_id", &stop.stop_id).with("scope", &stop.scope)),
         None => Ok(()),
