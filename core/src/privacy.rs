@@ -1,7 +1,7 @@
 //! What is kept where, of which class, what for and how long: the one list that jobs, metrics and docs/privacy.md are made from, and that the options of
 //! messages (`midshift/common/v1/privacy.proto`) are held against.
 //!
-//! Invariant: each table and each log stands in [`KEPT`] once. Nothing here reads a clock or a store.
+//! Invariant: each table and each log stands in [`RETENTION_RULES`] once. Nothing here reads a clock or a store.
 
 use crate::limits;
 use crate::robot::{Pose, Vitals};
@@ -132,9 +132,9 @@ impl Place {
     }
 }
 
-/// One place and what it holds.
+/// The rule of one place where something is kept: what it holds, what for, and for how long.
 #[derive(Clone, Copy, Debug)]
-pub struct Kept {
+pub struct RetentionRule {
     /// The place that outlives the call.
     pub place: Place,
     /// What: the first is what the place is there for, the others come with it.
@@ -145,7 +145,7 @@ pub struct Kept {
     pub retention: Retention,
 }
 
-impl Kept {
+impl RetentionRule {
     /// The age beyond which nothing may be here, milliseconds; none: it does not go by age.
     pub const fn age_max_ms(&self) -> Option<u64> {
         match self.place {
@@ -155,10 +155,10 @@ impl Kept {
     }
 }
 
-macro_rules! kept {
+macro_rules! retention_rules {
     ($($place:expr => [$($holds:ident),+] $purpose:ident $retention:ident;)*) => {
-        /// Every place where something is kept.
-        pub const KEPT: &[Kept] = &[$(Kept {
+        /// The rules of all places where something is kept.
+        pub const RETENTION_RULES: &[RetentionRule] = &[$(RetentionRule {
             place: $place,
             holds: &[$(DataClass::$holds),+],
             purpose: Purpose::$purpose,
@@ -167,7 +167,7 @@ macro_rules! kept {
     };
 }
 
-kept! {
+retention_rules! {
     Place::Table(Table::TaskIntake) => [Operations, Person] Operate Month;
     Place::Table(Table::TaskRequest) => [Operations, Person] Operate Month;
     Place::Table(Table::RequestKey) => [Operations] Operate Week;
@@ -242,8 +242,8 @@ kept! {
 
 /// How long rows of a table are kept; [`Retention::Standing`] where the list does not know it.
 pub fn retention_of(table: Table) -> Retention {
-    let found = KEPT.iter().find(|kept| kept.place == Place::Table(table));
-    found.map_or(Retention::Standing, |kept| kept.retention)
+    let found = RETENTION_RULES.iter().find(|rule| rule.place == Place::Table(table));
+    found.map_or(Retention::Standing, |rule| rule.retention)
 }
 
 /// One coordinate, as it is kept after [`PRECISE_MS`]: the middle of its stretch of [`limits::POSITION_COARSE_MM`]. Coarse again, it is the same.
@@ -272,7 +272,7 @@ mod tests {
 
     #[test]
     fn each_table_and_each_log_is_in_the_list_once() {
-        let mut named: Vec<&str> = KEPT.iter().map(|kept| kept.place.as_str()).collect();
+        let mut named: Vec<&str> = RETENTION_RULES.iter().map(|rule| rule.place.as_str()).collect();
         let all = named.len();
         named.sort_unstable();
         named.dedup();
@@ -280,10 +280,14 @@ mod tests {
         let tables = Table::ALL.iter().map(|table| Place::Table(*table));
         let missing: Vec<&str> = tables
             .chain(Log::ALL.map(Place::Log))
-            .filter(|place| KEPT.iter().all(|kept| kept.place != *place))
+            .filter(|place| RETENTION_RULES.iter().all(|rule| rule.place != *place))
             .map(Place::as_str)
             .collect();
-        assert_eq!(missing, Vec::<&str>::new(), "say in KEPT of what class they are and how long they are kept");
+        assert_eq!(
+            missing,
+            Vec::<&str>::new(),
+            "say in RETENTION_RULES of what class they are and how long they are kept"
+        );
     }
 
     #[test]
@@ -291,9 +295,12 @@ mod tests {
         for table in Table::ALL.iter().filter(|table| table.is_audit()) {
             assert_eq!(retention_of(*table), Retention::Year, "{}", table.name());
         }
-        let longest = KEPT.iter().filter_map(Kept::age_max_ms).max();
+        let longest = RETENTION_RULES.iter().filter_map(RetentionRule::age_max_ms).max();
         assert_eq!(longest, Some(limits::AUDIT_DAYS * DAY_MS));
-        assert!(KEPT.iter().all(|kept| kept.retention != Retention::Transit), "what is kept outlives its call");
+        assert!(
+            RETENTION_RULES.iter().all(|rule| rule.retention != Retention::Transit),
+            "what is kept outlives its call"
+        );
     }
 
     #[test]

@@ -2,7 +2,7 @@
 //! is never shown. Each rule is a function of descriptors, tried on some that break it.
 
 use midshift_core::limits;
-use midshift_core::privacy::{DataClass, KEPT, Place, Purpose, Retention};
+use midshift_core::privacy::{DataClass, Place, Purpose, RETENTION_RULES, Retention};
 use midshift_proto::FILE_DESCRIPTOR_SET;
 use prost_reflect::{DescriptorPool, DynamicMessage, FieldDescriptor, Kind, MessageDescriptor, ReflectMessage};
 use std::collections::{BTreeMap, BTreeSet};
@@ -227,7 +227,9 @@ fn misnamed(messages: &[MessageDescriptor]) -> Vec<String> {
 
 /// Kinds of data that the wire says are kept, and the list of places does not.
 fn homeless(messages: &[MessageDescriptor]) -> Vec<String> {
-    let is_kept = |class, retention| KEPT.iter().any(|kept| kept.holds.contains(&class) && kept.retention == retention);
+    let is_kept = |class, retention| {
+        RETENTION_RULES.iter().any(|rule| rule.holds.contains(&class) && rule.retention == retention)
+    };
     let fields = messages.iter().flat_map(MessageDescriptor::fields);
     let said = messages.iter().filter_map(of_message).chain(fields.filter_map(|field| of_field(&field)));
     let said: BTreeSet<Said> = said
@@ -378,7 +380,7 @@ fn what_messages_say_is_kept_has_a_place_in_the_list() {
     assert_eq!(homeless(&ours(&pool)), Vec::<String>::new());
     let body = "message M { option (midshift.common.v1.privacy) = {data: DATA_CLASS_POSITION, purpose: PURPOSE_ACCOUNT, retention: RETENTION_YEAR}; }";
     assert_eq!(homeless(&made_up(body)), ["position kept year"], "nobody said where positions stay for a year");
-    assert!(KEPT.iter().any(|kept| kept.place == Place::Samples));
+    assert!(RETENTION_RULES.iter().any(|rule| rule.place == Place::Samples));
 }
 
 #[test]
@@ -460,8 +462,8 @@ fn a_secret_is_never_shown_by_debug() {
 fn tables(messages: &[MessageDescriptor]) -> Vec<(&'static str, String)> {
     let classes = DataClass::ALL.iter().map(|class| format!("| `{}` | {} |", class.as_str(), class.says()));
     let mut all = vec![("classes", table("| class | what it is |\n|---|---|", classes.collect()))];
-    let places = KEPT.iter().map(|kept| {
-        let kind = match kept.place {
+    let places = RETENTION_RULES.iter().map(|rule| {
+        let kind = match rule.place {
             Place::Table(_) => "table",
             Place::Log(_) => "log",
             Place::Samples | Place::CoarseSamples => "samples",
@@ -469,13 +471,13 @@ fn tables(messages: &[MessageDescriptor]) -> Vec<(&'static str, String)> {
             Place::File(_) => "file",
             Place::Robot(_) => "on the robot",
         };
-        let holds: Vec<&str> = kept.holds.iter().map(|class| class.as_str()).collect();
-        let long = match kept.place {
+        let holds: Vec<&str> = rule.holds.iter().map(|class| class.as_str()).collect();
+        let long = match rule.place {
             Place::Samples => "24 hours, then coarser.",
-            _ if kept.retention == Retention::Coarsened => "30 days.",
-            _ => kept.retention.says(),
+            _ if rule.retention == Retention::Coarsened => "30 days.",
+            _ => rule.retention.says(),
         };
-        format!("| `{}` | {kind} | {} | {} | {long} |", kept.place.as_str(), holds.join(", "), kept.purpose.as_str())
+        format!("| `{}` | {kind} | {} | {} | {long} |", rule.place.as_str(), holds.join(", "), rule.purpose.as_str())
     });
     all.push(("places", table("| place | is | holds | for | how long |\n|---|---|---|---|---|", places.collect())));
     let mut said: BTreeMap<Said, Vec<String>> = BTreeMap::new();

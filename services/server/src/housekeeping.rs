@@ -1,7 +1,7 @@
 //! Housekeeping of every process: prunes old rows, entries and frames of its roles, tends the chains of the audit,
 //! folds samples of histograms.
 //!
-//! Which of it goes when is in [`midshift_core::privacy::KEPT`]. Called by [`crate::server`]. Invariant: nothing goes
+//! Which of it goes when is in [`midshift_core::privacy::RETENTION_RULES`]. Called by [`crate::server`]. Invariant: nothing goes
 //! that a service has not consumed, unless it has not been there for a month.
 
 mod oldest;

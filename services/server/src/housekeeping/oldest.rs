@@ -1,9 +1,9 @@
 //! How old what is kept is, for each place that goes by age: the metric by which anybody sees that the purge works, and the test that it does.
 //!
-//! Invariant: nothing is taken away here. The list of places and ages is [`privacy::KEPT`], by which the jobs go too.
+//! Invariant: nothing is taken away here. The list of places and ages is [`privacy::RETENTION_RULES`], by which the jobs go too.
 
 use midshift_core::audit::AuditRow;
-use midshift_core::privacy::{self, DataClass, Kept, Place};
+use midshift_core::privacy::{self, DataClass, Place, RetentionRule};
 use midshift_core::rows::{Log, Row, Seq, Table};
 use midshift_core::stop::record::StopRecord;
 use midshift_core::task::{Phase, TaskState};
@@ -30,11 +30,11 @@ pub struct Oldest {
 /// If the store or the log of samples cannot be read.
 pub async fn find_oldest(store: &dyn Store, frames: &dyn FrameLog, clock: &dyn Clock) -> Result<Vec<Oldest>, Error> {
     let (now, mut found) = (clock.now(), Vec::new());
-    for kept in privacy::KEPT {
-        if let (Some(age_max_ms), Some(class)) = (kept.age_max_ms(), kept.holds.first())
-            && let Some(age_ms) = age(store, frames, now, kept).await?
+    for rule in privacy::RETENTION_RULES {
+        if let (Some(age_max_ms), Some(class)) = (rule.age_max_ms(), rule.holds.first())
+            && let Some(age_ms) = age(store, frames, now, rule).await?
         {
-            found.push(Oldest { place: kept.place, class: *class, age_ms, age_max_ms });
+            found.push(Oldest { place: rule.place, class: *class, age_ms, age_max_ms });
         }
     }
     Ok(found)
@@ -54,9 +54,9 @@ pub async fn publish_ages(store: &dyn Store, frames: &dyn FrameLog, clock: &dyn 
 }
 
 /// Milliseconds; none: this place is not asked.
-async fn age(store: &dyn Store, frames: &dyn FrameLog, now: Now, kept: &Kept) -> Result<Option<u64>, Error> {
+async fn age(store: &dyn Store, frames: &dyn FrameLog, now: Now, rule: &RetentionRule) -> Result<Option<u64>, Error> {
     let wall = |at: Option<i64>| Some(at.map_or(0, |at| now.wall.ms_since(Utc(at))));
-    Ok(match kept.place {
+    Ok(match rule.place {
         Place::Samples => wall(frames.oldest().await?.precise),
         Place::CoarseSamples => wall(frames.oldest().await?.any),
         Place::Log(log) => wall(first_entry(store, log).await?),
@@ -64,7 +64,7 @@ async fn age(store: &dyn Store, frames: &dyn FrameLog, now: Now, kept: &Kept) ->
         Place::Table(Table::StopRecord) => wall(reset(store).await?.map(|at| at.0)),
         Place::Table(table) if table.is_audit() => wall(first_of_chain(store, table).await?),
         Place::Table(Table::RequestKey | Table::TaskRequest | Table::CommandKey | Table::OtaCommandKey) => {
-            let Place::Table(table) = kept.place else { return Ok(None) };
+            let Place::Table(table) = rule.place else { return Ok(None) };
             wall(first(store, table).await?.and_then(|row| row.index.order))
         }
         Place::Table(_) | Place::Gaps | Place::Heard | Place::File(_) | Place::Robot(_) => None,

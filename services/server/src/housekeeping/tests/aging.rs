@@ -245,7 +245,8 @@ fn every_place_that_goes_by_age_is_looked_at_or_has_its_reason() {
         let frames = MemoryFrames::new(wall.clone(), u64::MAX);
         find_oldest(&store, &frames, wall.as_ref()).await.expect("read")
     });
-    let by_age = privacy::KEPT.iter().filter(|kept| kept.age_max_ms().is_some()).map(|kept| kept.place.as_str());
+    let by_age =
+        privacy::RETENTION_RULES.iter().filter(|rule| rule.age_max_ms().is_some()).map(|rule| rule.place.as_str());
     let looked_at: Vec<&str> = looked_at.iter().map(|o| o.place.as_str()).collect();
     let left: Vec<&str> = by_age.filter(|place| !looked_at.contains(place)).collect();
     assert_eq!(left, others);
