@@ -43,9 +43,9 @@ pub struct Beat {
     pub is_staged: bool,
 }
 
-/// One STATUS sample in the record.
+/// One STATUS sample as the frame log has it.
 #[derive(Clone, Copy, Debug)]
-struct Kept {
+struct StoredSample {
     made_ms: i64,
     durable_ms: i64,
     battery: u32,
@@ -164,7 +164,7 @@ pub async fn told_ms(channel: Channel, robot_id: &str, code: u32, from_ms: i64) 
 }
 
 /// Every STATUS sample of a robot in the record of a server that has ended, by number.
-async fn record(data: &Path, robot_id: &str) -> anyhow::Result<BTreeMap<u64, Kept>> {
+async fn record(data: &Path, robot_id: &str) -> anyhow::Result<BTreeMap<u64, StoredSample>> {
     let site = text::parse(DEMO)?.site_id().clone();
     let frames = SqliteFrames::open(data, site, midshift_process::clock::clock(1000), FRAME_BYTES_DEFAULT).await?;
     let (mut kept, mut position) = (BTreeMap::new(), 0);
@@ -177,7 +177,7 @@ async fn record(data: &Path, robot_id: &str) -> anyhow::Result<BTreeMap<u64, Kep
                 if let Some(sample::Body::Status(vitals)) = sample.body {
                     let (battery, joint) = (vitals.battery_permille, vitals.hottest_joint_decidegrees);
                     let (made_ms, durable_ms) = (sample.robot_unix_ms, stored.at_unix_ms);
-                    kept.insert(sample.seq, Kept { made_ms, durable_ms, battery, joint });
+                    kept.insert(sample.seq, StoredSample { made_ms, durable_ms, battery, joint });
                 }
             }
         }
