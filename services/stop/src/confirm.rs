@@ -94,8 +94,8 @@ impl Watching<'_> {
         let mut seen = Seen { news: Vec::new(), counts: v1::Counts::default(), is_over: true };
         let mut found = BTreeMap::new();
         for robot in &robots {
-            let said = robot.said();
-            let heard = said.heard.as_ref();
+            let state = robot.state();
+            let heard = state.heard.as_ref();
             let one = Found {
                 confirmation: confirmation(&self.stop, since, &robot.robot_id, heard, now.link),
                 obeys: heard.map(|h| h.level),

@@ -9,7 +9,7 @@ use crate::changes;
 use crate::downlink::Down;
 use crate::inner::Inner;
 use crate::outbox::{End, Outbox};
-use crate::robots::{Comes, Held, Robot, Robots};
+use crate::robots::{Attaching, HeldByAnother, Robot, Robots};
 use crate::threads::lock;
 use midshift_core::identity::Caller;
 use midshift_core::ids::{RobotId, StopId};
@@ -66,7 +66,7 @@ async fn begin(
         // No change of the latch falls between: the line begins with the whole, and hears of everything after it.
         let _fan = lock(&inner.fan);
         changes::is_open(inner)?;
-        Robots::attach(&robot, &outbox, Comes { boot_id, foreign }, now.link)
+        Robots::attach(&robot, &outbox, Attaching { boot_id, foreign }, now.link)
     };
     attached.map_err(|held| held_by_another(inner, &robot_id, by, held, &now))?;
     metrics::gauge!("midshift_stop_lines").increment(1);
@@ -76,7 +76,7 @@ async fn begin(
 }
 
 /// Another start of this robot is heard: a second machine, or a first one that lost its power a moment ago.
-fn held_by_another(inner: &Inner, robot_id: &RobotId, by: &Caller, held: Held, now: &Now) -> Refusal {
+fn held_by_another(inner: &Inner, robot_id: &RobotId, by: &Caller, held: HeldByAnother, now: &Now) -> Refusal {
     metrics::counter!("midshift_stop_lines_contested_total").increment(1);
     if held.is_news {
         tracing::warn!(peer = Empty, %robot_id, "another start of this robot was not let in while one is heard");
@@ -191,7 +191,7 @@ fn check_in(inner: &Inner, robot: &Robot, outbox: &Arc<Outbox>, said: CheckIn, n
         around: said.around,
         awaiting: said.awaiting.into_iter().collect(),
     };
-    let mut state = robot.said();
+    let mut state = robot.state();
     if !state.line.as_ref().is_some_and(|line| Arc::ptr_eq(line, outbox)) {
         return;
     }

@@ -1,4 +1,4 @@
-//! Who belongs to the fleet and what each robot said last.
+//! Holds the robots of the fleet, with the newest state of each: its check-in, its line, and the stops that it keeps.
 //!
 //! Invariant: bounded; each robot has a lock of its own that is held for moments, so that whoever reads of all robots holds up nobody.
 
@@ -16,12 +16,12 @@ use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard};
 pub struct Robot {
     /// The robot's id.
     pub robot_id: RobotId,
-    said: Mutex<Said>,
+    state: Mutex<RobotState>,
 }
 
-/// What is known of it.
+/// The state of one robot, as this process knows it.
 #[derive(Default)]
-pub struct Said {
+pub struct RobotState {
     /// Its newest check-in with this process.
     pub heard: Option<Heard>,
     /// Stops that it keeps and that are not the service's.
@@ -40,24 +40,24 @@ pub struct Said {
     pub held: Option<LinkTime>,
 }
 
-/// Who comes.
-pub struct Comes {
+/// A robot that begins its line.
+pub struct Attaching {
     /// The start of its agent.
     pub boot_id: String,
     /// Stops that it keeps and that are not the service's.
     pub foreign: BTreeSet<StopId>,
 }
 
-/// Somebody who is not let in, because another start of the robot is heard.
+/// Why a line is refused: another start of the robot is heard.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Held {
+pub struct HeldByAnother {
     /// So long at least nobody else is let in.
     pub for_now: LinkDuration,
     /// It is to be noted: it was not for a while.
     pub is_news: bool,
 }
 
-impl Said {
+impl RobotState {
     /// How long its line still counts as heard. None: there is none, or it says nothing.
     fn holds_for(&self, now: LinkTime) -> Option<LinkDuration> {
         self.line.as_ref()?;
@@ -67,7 +67,7 @@ impl Said {
     }
 }
 
-impl Said {
+impl RobotState {
     /// When its own silence has stood it at the latest. Of one that was never heard: as if it had been until now.
     fn stands_by(&self, now: LinkTime) -> LinkTime {
         match &self.heard {
@@ -84,9 +84,9 @@ impl Said {
 }
 
 impl Robot {
-    /// What is known of it.
-    pub fn said(&self) -> std::sync::MutexGuard<'_, Said> {
-        lock(&self.said)
+    /// Locks its state.
+    pub fn state(&self) -> std::sync::MutexGuard<'_, RobotState> {
+        lock(&self.state)
     }
 }
 
@@ -123,7 +123,7 @@ impl Robots {
             };
             map.remove(&stray);
         }
-        let robot = || Arc::new(Robot { robot_id: robot_id.clone(), said: Mutex::default() });
+        let robot = || Arc::new(Robot { robot_id: robot_id.clone(), state: Mutex::default() });
         Ok(map.entry(robot_id.clone()).or_insert_with(robot).clone())
     }
 
@@ -131,20 +131,20 @@ impl Robots {
     pub fn list(&self, listed: &BTreeSet<RobotId>, now: LinkTime) {
         let mut map = self.0.write().unwrap_or_else(PoisonError::into_inner);
         for (robot_id, robot) in map.iter() {
-            let mut said = robot.said();
-            let was_listed = std::mem::replace(&mut said.is_listed, listed.contains(robot_id));
-            if said.is_listed {
-                said.leaves = None;
+            let mut state = robot.state();
+            let was_listed = std::mem::replace(&mut state.is_listed, listed.contains(robot_id));
+            if state.is_listed {
+                state.leaves = None;
             } else if was_listed {
-                said.leaves = Some(said.stands_by(now));
+                state.leaves = Some(state.stands_by(now));
             }
         }
         for robot_id in listed {
             if map.len() >= limits::STOP_ROBOTS_MAX {
                 break;
             }
-            let said = || Mutex::new(Said { is_listed: true, ..Said::default() });
-            let robot = || Arc::new(Robot { robot_id: robot_id.clone(), said: said() });
+            let state = || Mutex::new(RobotState { is_listed: true, ..RobotState::default() });
+            let robot = || Arc::new(Robot { robot_id: robot_id.clone(), state: state() });
             map.entry(robot_id.clone()).or_insert_with(robot);
         }
     }
@@ -152,19 +152,19 @@ impl Robots {
     /// Whether a robot has said that it keeps this stop, lies inside of it or waits for its resume.
     pub fn knows(&self, stop_id: &StopId) -> bool {
         self.read().values().any(|robot| {
-            let said = robot.said();
+            let state = robot.state();
             let says = |heard: &Heard| heard.inside.contains(stop_id) || heard.awaiting.contains(stop_id);
-            said.foreign.contains(stop_id) || said.heard.as_ref().is_some_and(says)
+            state.foreign.contains(stop_id) || state.heard.as_ref().is_some_and(says)
         })
     }
 
     /// Removes robots that left the roster, have no line, and stand by their own silence. Returns whether any went.
     pub fn let_go(&self, now: LinkTime) -> bool {
-        if !self.read().values().any(|robot| robot.said().is_gone(now)) {
+        if !self.read().values().any(|robot| robot.state().is_gone(now)) {
             return false;
         }
         let mut map = self.0.write().unwrap_or_else(PoisonError::into_inner);
-        map.retain(|_, robot| !robot.said().is_gone(now));
+        map.retain(|_, robot| !robot.state().is_gone(now));
         true
     }
 
@@ -172,7 +172,7 @@ impl Robots {
     pub fn tell_lines(&self, frame: &Frame, now: LinkTime) -> usize {
         let mut told = 0;
         for robot in self.read().values() {
-            if let Some(line) = &robot.said().line {
+            if let Some(line) = &robot.state().line {
                 line.add_change(frame, now);
                 told += 1;
             }
@@ -182,7 +182,7 @@ impl Robots {
 
     /// All lines.
     pub fn lines(&self) -> Vec<Arc<Outbox>> {
-        self.read().values().filter_map(|robot| robot.said().line.clone()).collect()
+        self.read().values().filter_map(|robot| robot.state().line.clone()).collect()
     }
 
     /// A line begins; an older one of the same robot ends. A start of it that is heard keeps its line: whoever has a copy of its key takes nothing over, and says
@@ -190,25 +190,25 @@ impl Robots {
     ///
     /// # Errors
     /// Another start of this robot is heard.
-    pub fn attach(robot: &Robot, line: &Arc<Outbox>, comes: Comes, now: LinkTime) -> Result<(), Held> {
-        let Comes { boot_id, foreign } = comes;
-        let mut said = robot.said();
-        if said.boot_id != boot_id {
-            if let Some(for_now) = said.holds_for(now) {
-                let is_news = said.held.is_none_or(|at| now.since(at) >= limits::LINE_HELD_NOTED_EVERY);
+    pub fn attach(robot: &Robot, line: &Arc<Outbox>, comes: Attaching, now: LinkTime) -> Result<(), HeldByAnother> {
+        let Attaching { boot_id, foreign } = comes;
+        let mut state = robot.state();
+        if state.boot_id != boot_id {
+            if let Some(for_now) = state.holds_for(now) {
+                let is_news = state.held.is_none_or(|at| now.since(at) >= limits::LINE_HELD_NOTED_EVERY);
                 if is_news {
-                    said.held = Some(now);
+                    state.held = Some(now);
                 }
-                return Err(Held { for_now, is_news });
+                return Err(HeldByAnother { for_now, is_news });
             }
             // What another start confirmed confirms nothing of this one.
-            if let Some(heard) = &mut said.heard {
+            if let Some(heard) = &mut state.heard {
                 heard.generation = 0;
             }
-            said.boot_id = boot_id;
+            state.boot_id = boot_id;
         }
-        (said.foreign, said.begun) = (foreign, now);
-        if let Some(older) = said.line.replace(line.clone()) {
+        (state.foreign, state.begun) = (foreign, now);
+        if let Some(older) = state.line.replace(line.clone()) {
             older.end(End::Refused(Refusal::new(Kind::Conflict, Code::LineReplaced)), now);
         }
         Ok(())
@@ -216,16 +216,16 @@ impl Robots {
 
     /// A line is over.
     pub fn detach(robot: &Robot, line: &Arc<Outbox>) {
-        let mut said = robot.said();
-        if said.line.as_ref().is_some_and(|current| Arc::ptr_eq(current, line)) {
-            said.line = None;
+        let mut state = robot.state();
+        if state.line.as_ref().is_some_and(|current| Arc::ptr_eq(current, line)) {
+            state.line = None;
         }
     }
 }
 
 fn is_stray(robot: &Robot) -> bool {
-    let said = robot.said();
-    !said.is_listed && said.line.is_none()
+    let state = robot.state();
+    !state.is_listed && state.line.is_none()
 }
 
 #[cfg(test)]
@@ -245,10 +245,10 @@ mod tests {
         let robots = Robots::default();
         let names = |robots: &Robots| robots.all().iter().map(|r| r.robot_id.to_string()).collect::<Vec<_>>().join(" ");
         robots.list(&[1, 2, 3].map(id).into(), LinkTime(0));
-        robots.find_or_add(&id(1)).unwrap().said().heard = Some(heard(LinkTime(9_000), Around::People));
-        robots.find_or_add(&id(2)).unwrap().said().heard = Some(heard(LinkTime(9_000), Around::Robots));
+        robots.find_or_add(&id(1)).unwrap().state().heard = Some(heard(LinkTime(9_000), Around::People));
+        robots.find_or_add(&id(2)).unwrap().state().heard = Some(heard(LinkTime(9_000), Around::Robots));
         // One that nobody ever listed: it has a line before it has a session.
-        robots.find_or_add(&id(4)).unwrap().said().heard = Some(heard(LinkTime(9_000), Around::People));
+        robots.find_or_add(&id(4)).unwrap().state().heard = Some(heard(LinkTime(9_000), Around::People));
         robots.list(&BTreeSet::new(), LinkTime(10_000));
         for (ms, left) in
             [(14_999, "r1 r2 r3 r4"), (15_000, "r2 r3 r4"), (39_000, "r3 r4"), (40_999, "r3 r4"), (41_000, "r4")]
@@ -275,7 +275,7 @@ mod tests {
         robots.find_or_add(&id(99_999)).unwrap();
         assert_eq!(robots.all().len(), limits::STOP_ROBOTS_MAX);
         assert!(robots.all().iter().all(|robot| robot.robot_id != id(0)), "the stray one went");
-        robots.find_or_add(&id(99_999)).unwrap().said().line = Some(Arc::new(Outbox::new(BTreeSet::new())));
+        robots.find_or_add(&id(99_999)).unwrap().state().line = Some(Arc::new(Outbox::new(BTreeSet::new())));
         assert_eq!(robots.find_or_add(&id(99_998)).err().map(|refusal| refusal.kind()), Some(Kind::Exhausted));
     }
 }

@@ -107,8 +107,8 @@ pub fn status(inner: &Inner) -> v1::Status {
     let mut tally = Tally::new(&stops);
     let mut robots = Vec::new();
     for robot in inner.robots.all() {
-        let said = robot.said();
-        let heard = said.heard.as_ref();
+        let state = robot.state();
+        let heard = state.heard.as_ref();
         tally.add(&robot.robot_id, heard, &now);
         robots.push(v1::RobotStatus {
             robot_id: robot.robot_id.to_string(),
@@ -116,7 +116,7 @@ pub fn status(inner: &Inner) -> v1::Status {
             standstill: heard.is_some_and(|h| h.is_still),
             heard_unix_ms: heard.map_or(0, |h| wall_at(&now, h.at).0),
             awaiting_resume: heard.map(|h| names(&h.awaiting)).unwrap_or_default(),
-            foreign_stops: names(said.foreign.difference(&resets)),
+            foreign_stops: names(state.foreign.difference(&resets)),
             durable: heard.is_some_and(|h| h.is_durable),
             heard: heard.is_some_and(|h| is_heard(h, &now)),
         });

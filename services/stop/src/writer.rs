@@ -68,7 +68,7 @@ pub async fn write_until_end(inner: &Arc<Inner>, mut writer: Writer) {
         if is_due || tail_is_due || !inner.disk.is_empty() {
             let before = refusing;
             (writer, refusing) = turn(inner, writer, version, is_due || tail_is_due).await;
-            said(before, refusing);
+            log_refusing(before, refusing);
             if refusing == Refusing::default() && !is_last {
                 continue;
             }
@@ -116,7 +116,7 @@ async fn turn(inner: &Arc<Inner>, mut writer: Writer, version: u64, is_due: bool
 }
 
 /// One line a change.
-fn said(before: Refusing, now: Refusing) {
+fn log_refusing(before: Refusing, now: Refusing) {
     metrics::gauge!("midshift_stop_latch_durable").set(f64::from(u8::from(!now.latch)));
     metrics::gauge!("midshift_stop_audit_durable").set(f64::from(u8::from(!now.audit)));
     for (file, before, now) in [("latch", before.latch, now.latch), ("audit", before.audit, now.audit)] {
