@@ -219,7 +219,7 @@ pub fn settle(inner: &Inner, version: u64) {
         return;
     }
     for (reset, generation) in settled {
-        for bytes in frames::told([], [&reset], generation) {
+        for bytes in frames::encode_changes([], [&reset], generation) {
             let resets = [reset.stop_id.clone()].into();
             inner.robots.tell_lines(&Frame { generation, bytes, resets }, now.link);
         }
@@ -231,7 +231,7 @@ pub fn settle(inner: &Inner, version: u64) {
 }
 
 fn tell_lines(inner: &Inner, stop: &Stop, generation: u64, now: &Now) -> usize {
-    let told = frames::told([stop], [], generation).into_iter();
+    let told = frames::encode_changes([stop], [], generation).into_iter();
     told.map(|bytes| inner.robots.tell_lines(&Frame { generation, bytes, resets: [].into() }, now.link)).sum()
 }
 

@@ -220,7 +220,7 @@ impl EngagedStops {
     /// All that is effective, as messages to a robot.
     pub fn everything(&mut self) -> Arc<[Bytes]> {
         let latch = &self.latch;
-        self.everything.get_or_insert_with(|| frames::told(latch.effective(), [], 0).into()).clone()
+        self.everything.get_or_insert_with(|| frames::encode_changes(latch.effective(), [], 0).into()).clone()
     }
 
     fn change(&mut self) {

@@ -16,8 +16,8 @@ fn encoded_facts(facts: v1::StopFacts, facts_generation: u64) -> Bytes {
     v1::AttendResponse { message: Some(W::Facts(facts)), facts_generation }.encode_to_vec().into()
 }
 
-/// Stops and resets, in as many messages as they need. `generation` 0: they are a part of what `synced` ends.
-pub fn told<'a>(
+/// Encodes stops and resets, in as many messages as they need. `generation` 0: they are a part of what `synced` ends.
+pub fn encode_changes<'a>(
     stops: impl IntoIterator<Item = &'a Stop>,
     resets: impl IntoIterator<Item = &'a Reset>,
     generation: u64,

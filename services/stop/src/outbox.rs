@@ -191,7 +191,7 @@ impl Waiting {
             let mut engaged_stops = lock(engaged_stops);
             self.whole.extend(engaged_stops.everything().iter().cloned());
             let resets = resets.iter().filter_map(|id| engaged_stops.latch().reset_of(id));
-            self.whole.extend(frames::told([], resets, 0));
+            self.whole.extend(frames::encode_changes([], resets, 0));
             self.sent = engaged_stops.generation();
             self.whole.push_back(frames::synced(self.sent, &key.public()));
             return self.whole.pop_front();
@@ -269,7 +269,7 @@ mod tests {
         outbox.answer(2, generation, LinkTime(5));
         let synced = frames::synced(generation, &inner.key.public());
         assert!(heard().contains(&synced), "it is told the whole");
-        let bytes = frames::told([], [&reset], generation).remove(0);
+        let bytes = frames::encode_changes([], [&reset], generation).remove(0);
         outbox.add_change(&Frame { generation, bytes: bytes.clone(), resets: [reset.stop_id].into() }, LinkTime(5));
         assert_eq!(heard(), [bytes]);
     }

@@ -75,7 +75,7 @@ impl Key {
 
     /// Puts the mark on a stop.
     pub fn mark(&self, stop: &mut Stop) {
-        stop.proof = self.0.sign(&told(stop)).to_bytes().to_vec();
+        stop.proof = self.0.sign(&signed_bytes(stop)).to_bytes().to_vec();
     }
 
     /// Puts the mark on a reset.
@@ -91,11 +91,12 @@ impl Key {
     /// Whether this stop, as it is, was marked with this key.
     pub fn knows(&self, stop: &Stop) -> bool {
         let Ok(signature) = Signature::from_slice(&stop.proof) else { return false };
-        self.0.verifying_key().verify_strict(&told(stop), &signature).is_ok()
+        self.0.verifying_key().verify_strict(&signed_bytes(stop), &signature).is_ok()
     }
 }
 
-fn told(stop: &Stop) -> Vec<u8> {
+/// The bytes of a stop that are signed: all of it but the proof.
+fn signed_bytes(stop: &Stop) -> Vec<u8> {
     let wire = v1::Stop { proof: Vec::new(), ..stop.into() };
     let mut bytes = DOMAIN.to_vec();
     bytes.extend(wire.encode_to_vec());

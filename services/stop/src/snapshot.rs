@@ -105,8 +105,8 @@ impl Principals {
         Ok(utimensat(CWD, folder.join(Self::NAME), &times, AtFlags::empty())?)
     }
 
-    /// When it was written, or said to be still so; none: it is not there. UTC of the machine that the folder is on.
-    pub fn told(folder: &Path) -> Option<Utc> {
+    /// When it was written, or affirmed since; none: it is not there. UTC of the machine that the folder is on.
+    pub fn written_at(folder: &Path) -> Option<Utc> {
         let found = fs::metadata(folder.join(Self::NAME)).ok()?;
         Some(Utc(found.mtime() * 1_000 + found.mtime_nsec() / 1_000_000))
     }

@@ -118,7 +118,7 @@ pub fn run(args: Args, shutdown: CancellationToken) -> Boxed<'static, anyhow::Re
 }
 
 async fn run_watched(args: Args, shutdown: CancellationToken, opened: &OnceLock<StopService>) -> anyhow::Result<()> {
-    let asked = next::asked()?;
+    let asked = next::listen()?;
     if args.insecure {
         tracing::warn!(address = %args.listen, "no TLS and no login: whoever reaches this port may stop the fleet and reset stops");
     }

@@ -47,11 +47,11 @@ pub fn ready() -> anyhow::Result<()> {
     out.write_all(&[READY]).and_then(|()| out.flush()).context("the stop service before this one is gone")
 }
 
-/// Hears from now on who asks for a next one: unheard, SIGUSR2 would end this process.
+/// Listens from now on for SIGUSR2, which asks for a next service. Without a listener it would end this process.
 ///
 /// # Errors
 /// The system gives no way to hear it.
-pub fn asked() -> anyhow::Result<Signal> {
+pub fn listen() -> anyhow::Result<Signal> {
     signal(SignalKind::user_defined2()).context("hearing SIGUSR2")
 }
 

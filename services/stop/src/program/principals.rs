@@ -48,14 +48,14 @@ pub async fn follow(folder: &Path, site: &Site, clock: &Arc<dyn Clock>) -> anyho
         denials,
     };
     let (folder, mut last) = (folder.to_owned(), first);
-    let said = watch::Sender::new(Principals::told(&folder).unwrap_or_default());
+    let said = watch::Sender::new(Principals::written_at(&folder).unwrap_or_default());
     let (followed, mut is_readable) = (said.subscribe(), true);
     // As long as the port is open: it ends with the receivers.
     tokio::spawn(async move {
         while !directory.is_closed() {
             tokio::time::sleep(PRINCIPALS_EVERY).await;
             let read = Principals::read(&folder);
-            if let (Ok(Some(_)), Some(told)) = (&read, Principals::told(&folder)) {
+            if let (Ok(Some(_)), Some(told)) = (&read, Principals::written_at(&folder)) {
                 said.send_replace(told);
             }
             match read {
