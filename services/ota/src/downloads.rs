@@ -78,13 +78,13 @@ impl Downloads {
 
     /// Signed files that were found damaged and that nobody was told of.
     pub(crate) fn damaged(&self) -> BTreeSet<Digest> {
-        self.shown.as_ref().map(|shown| shown.integrity.untold()).unwrap_or_default()
+        self.shown.as_ref().map(|shown| shown.integrity.unreported()).unwrap_or_default()
     }
 
-    /// People were told of these.
-    pub(crate) fn told_damaged(&self, files: &BTreeSet<Digest>) {
+    /// Marks damaged files as reported to people.
+    pub(crate) fn mark_damaged_reported(&self, files: &BTreeSet<Digest>) {
         if let Some(shown) = &self.shown {
-            shown.integrity.told(files);
+            shown.integrity.mark_reported(files);
         }
     }
 

@@ -97,12 +97,12 @@ impl Integrity {
     }
 
     /// Files that were found damaged and that nobody was told of.
-    pub fn untold(&self) -> BTreeSet<Digest> {
+    pub fn unreported(&self) -> BTreeSet<Digest> {
         self.damaged().clone()
     }
 
-    /// People were told of these.
-    pub fn told(&self, files: &BTreeSet<Digest>) {
+    /// Marks damaged files as reported to people.
+    pub fn mark_reported(&self, files: &BTreeSet<Digest>) {
         self.damaged().retain(|digest| !files.contains(digest));
     }
 }

@@ -42,7 +42,7 @@ async fn a_file_that_was_damaged_is_not_handed_out_and_can_be_brought_again() {
     let damaged = opened.downloads.damaged();
     assert_eq!(damaged.iter().copied().collect::<Vec<_>>(), [file.digest]);
     assert_eq!(opened.downloads.damaged(), damaged, "it is kept until somebody was told");
-    opened.downloads.told_damaged(&damaged);
+    opened.downloads.mark_damaged_reported(&damaged);
     assert!(opened.downloads.damaged().is_empty(), "it is told once");
     opened.content.append(file, 0, content.into()).await.expect("room");
     assert_eq!(opened.content.settle(file).await.expect("whole"), Held::Whole);

@@ -368,7 +368,7 @@ impl Loop {
             tracing::error!(text, "roll-outs passed over something they cannot read");
         }
         self.renew_and_commit(renewal, now, plan, replies).await?;
-        opened.downloads.told_damaged(&damaged);
+        opened.downloads.mark_damaged_reported(&damaged);
         self.answer(now);
         if let Some(seq) = foreign {
             self.changed.send_replace(seq);

@@ -83,7 +83,7 @@ impl Loop {
         }
         let results = self.parts.store.commit(plan.items).await;
         match (results.into_iter().find_map(Result::err), ota.opened()) {
-            (None, Ok(opened)) => opened.downloads.told_damaged(&damaged),
+            (None, Ok(opened)) => opened.downloads.mark_damaged_reported(&damaged),
             (Some(error), _) => tracing::warn!(%error, "people were not told of a damaged file; it is tried again"),
             // One without keys hands nothing out.
             (None, Err(_)) => {}
