@@ -70,11 +70,11 @@ async fn ready(resolved: &Resolved) -> Result<&'static str, String> {
     let mut line = String::new();
     let mut answer = BufReader::new(tokio::io::AsyncReadExt::take(stream, LINE_MAX));
     answer.read_line(&mut line).await.map_err(failed)?;
-    said(&line)
+    read_status_line(&line)
 }
 
-/// What the first line of an answer over HTTP/1.1 means.
-fn said(line: &str) -> Result<&'static str, String> {
+/// Reads the first line of an answer over HTTP/1.1.
+fn read_status_line(line: &str) -> Result<&'static str, String> {
     let code = line.strip_prefix("HTTP/1.1 ").and_then(|rest| rest.split(' ').next()).map(str::trim);
     match code {
         Some("200") => Ok("ready"),
@@ -85,14 +85,14 @@ fn said(line: &str) -> Result<&'static str, String> {
 
 #[cfg(test)]
 mod tests {
-    use super::said;
+    use super::read_status_line;
 
     #[test]
     fn only_200_is_ready() {
-        assert_eq!(said("HTTP/1.1 200 OK\r\n"), Ok("ready"));
-        assert_eq!(said("HTTP/1.1 503 Service Unavailable\r\n"), Err("not ready".to_owned()));
+        assert_eq!(read_status_line("HTTP/1.1 200 OK\r\n"), Ok("ready"));
+        assert_eq!(read_status_line("HTTP/1.1 503 Service Unavailable\r\n"), Err("not ready".to_owned()));
         for other in ["HTTP/1.1 404 Not Found\r\n", "HTTP/1.1 2000 OK\r\n", "SSH-2.0\r\n", ""] {
-            assert!(said(other).is_err(), "{other}");
+            assert!(read_status_line(other).is_err(), "{other}");
         }
     }
 }

@@ -66,11 +66,11 @@ pub async fn tell_kept(call: &Call, robot_id: &str, out: &Out) {
     }
     let places = list(call, true).await.map(|whole| whole.places).unwrap_or_default();
     for place in places.iter().filter(|place| place.holders.iter().any(|h| h.robot_id == robot_id)) {
-        out.next(&kept(place, robot_id));
+        out.next(&describe_kept_place(place, robot_id));
     }
 }
 
-fn kept(place: &v1::Place, robot_id: &str) -> String {
+fn describe_kept_place(place: &v1::Place, robot_id: &str) -> String {
     let (place_id, etag) = (&place.place_id, &place.etag);
     format!(
         "{place_id} stays kept for {robot_id} until it is heard and leaves it; if a person has looked and it is gone: \
@@ -110,7 +110,7 @@ mod tests {
     #[test]
     fn a_place_that_stays_kept_names_its_robot_and_the_whole_command_that_opens_it() {
         let place = v1::Place { place_id: "B03".into(), etag: "17".into(), ..v1::Place::default() };
-        let told = kept(&place, "q-1");
+        let told = describe_kept_place(&place, "q-1");
         assert!(told.starts_with("B03 stays kept for q-1"), "{told}");
         assert!(told.ends_with("midshift zone clear B03 --reason TEXT --if-match 17"), "{told}");
     }

@@ -12,11 +12,11 @@ pub struct Rules {
     #[arg(long, value_name = "PERCENT")]
     off_work: Option<u32>,
     /// So many robots with this capability stay in work, e.g. pick=3; pick=0 takes the rule away. Other capabilities stay as they are.
-    #[arg(long, value_name = "CAPABILITY=ROBOTS", value_parser = kept)]
+    #[arg(long, value_name = "CAPABILITY=ROBOTS", value_parser = parse_kept_in_work)]
     keep_in_work: Vec<(String, u32)>,
     /// Robots are taken out of work only then, e.g. "mon-fri 22:00-05:00 Europe/Berlin" or "daily 01:00-04:00 UTC". Takes the place of
     /// all windows before; "always" leaves none.
-    #[arg(long, value_name = "WINDOW", value_parser = window)]
+    #[arg(long, value_name = "WINDOW", value_parser = parse_window)]
     window: Vec<Window>,
     /// No robot is taken out of work for a roll-out.
     #[arg(long, value_name = "true|false", action = clap::ArgAction::Set)]
@@ -59,13 +59,13 @@ impl Rules {
     }
 }
 
-fn kept(text: &str) -> Result<(String, u32), String> {
+fn parse_kept_in_work(text: &str) -> Result<(String, u32), String> {
     let bad = || "must be CAPABILITY=ROBOTS, e.g. pick=3".to_owned();
     let (capability, robots) = text.split_once('=').filter(|(c, _)| !c.is_empty()).ok_or_else(bad)?;
     Ok((capability.to_owned(), robots.parse().map_err(|_| bad())?))
 }
 
-fn window(text: &str) -> Result<Window, String> {
+fn parse_window(text: &str) -> Result<Window, String> {
     let bad = || "must be DAYS FROM-TO ZONE, e.g. \"mon-fri 22:00-05:00 Europe/Berlin\", or always".to_owned();
     if text == "always" {
         return Ok(Window::Always);
@@ -108,7 +108,7 @@ fn minute(text: &str) -> Option<u32> {
     (hours < 24 && minutes < 60).then_some(hours * 60 + minutes)
 }
 
-fn told(window: &MaintenanceWindow) -> String {
+fn format_window(window: &MaintenanceWindow) -> String {
     let name = |day: &u32| DAYS.get((*day as usize).wrapping_sub(1)).copied().unwrap_or("?");
     let days = if window.days.is_empty() {
         "daily".to_owned()
@@ -127,7 +127,7 @@ pub fn shown(rules: &SoftwareRules) -> String {
         let kept: Vec<String> = rules.keep_in_work.iter().map(|(capability, n)| format!("{capability}={n}")).collect();
         text += &format!("  keep in work {}", kept.join(" "));
     }
-    let windows: Vec<String> = rules.windows.iter().map(told).collect();
+    let windows: Vec<String> = rules.windows.iter().map(format_window).collect();
     text += &if windows.is_empty() { "  at any time".to_owned() } else { format!("  only {}", windows.join("; ")) };
     text += if rules.acts_on_rates { "  rates of failures act" } else { "" };
     text + if rules.frozen { "  FROZEN" } else { "" }
@@ -138,7 +138,7 @@ mod tests {
     use super::*;
 
     fn at(text: &str) -> MaintenanceWindow {
-        match window(text) {
+        match parse_window(text) {
             Ok(Window::At(window)) => window,
             other => panic!("{text}: {other:?}"),
         }
@@ -149,9 +149,9 @@ mod tests {
         let friday = at("sat-mon,wed 22:00-05:30 Europe/Berlin");
         assert_eq!((friday.days.as_slice(), friday.from_minute, friday.to_minute), (&[1, 3, 6, 7][..], 1_320, 330));
         for text in ["daily 01:00-04:00 UTC", "mon,tue,wed,thu,fri 22:00-05:00 Europe/Berlin", "sun 00:00-23:59 UTC"] {
-            assert_eq!(told(&at(text)), text);
+            assert_eq!(format_window(&at(text)), text);
         }
-        assert_eq!(window("always"), Ok(Window::Always));
+        assert_eq!(parse_window("always"), Ok(Window::Always));
         for bad in [
             "",
             "never",
@@ -161,7 +161,7 @@ mod tests {
             "mon 01:00-02:00",
             "mon 01:00-02:00 UTC x",
         ] {
-            assert!(window(bad).is_err(), "{bad}");
+            assert!(parse_window(bad).is_err(), "{bad}");
         }
     }
 
@@ -197,7 +197,7 @@ mod tests {
 
     #[test]
     fn kept_capabilities_are_names_and_numbers() {
-        assert_eq!(kept("pick=3"), Ok(("pick".to_owned(), 3)));
-        assert!(kept("pick").is_err() && kept("=3").is_err() && kept("pick=some").is_err());
+        assert_eq!(parse_kept_in_work("pick=3"), Ok(("pick".to_owned(), 3)));
+        assert!(parse_kept_in_work("pick").is_err() && parse_kept_in_work("=3").is_err() && parse_kept_in_work("pick=some").is_err());
     }
 }

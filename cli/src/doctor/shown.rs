@@ -113,14 +113,16 @@ fn element(bytes: &[u8]) -> Option<(u8, &[u8], &[u8])> {
     Some((tag, content, rest))
 }
 
-/// What whoever answers takes for the time, in whole seconds, from the head of its answer.
-pub fn said(answer: &MetadataMap) -> Option<Utc> {
+/// The time of a server, in whole seconds, from the head of its answer; none: it does not say it.
+pub fn server_time(answer: &MetadataMap) -> Option<Utc> {
     answer.get("date").and_then(|date| date.to_str().ok()).and_then(date)
 }
 
 /// What its clock says beside this one.
 pub fn clock(whose: &str, answer: &MetadataMap, now: Utc) -> Finding {
-    let Some(said) = said(answer) else { return Finding::good("clocks", format!("{whose} does not say its time")) };
+    let Some(said) = server_time(answer) else {
+        return Finding::good("clocks", format!("{whose} does not say its time"));
+    };
     let (ahead, behind) = (said.ms_since(now), now.ms_since(said));
     if ahead.max(behind) <= AGREES_MS {
         return Finding::good("clocks", format!("{whose} and this machine agree"));

@@ -34,7 +34,7 @@ pub async fn check_stop_service(resolved: &Resolved, address: &str, now: Utc, on
     match status(resolved, address).await {
         Ok((head, status)) => {
             found.push(shown::clock("the stop service", &head, now));
-            found.extend(of_status(&status, shown::said(&head).unwrap_or(now), online));
+            found.extend(of_status(&status, shown::server_time(&head).unwrap_or(now), online));
         }
         Err(exit) => {
             found.push(Finding::wants_look("stop", format!("what it keeps and whom it hears cannot be read: {exit}")))

@@ -209,7 +209,7 @@ pub async fn run(args: Create, out: &Out) -> Result<(), Exit> {
     if args.dry_run {
         let request = v1::PlanRolloutRequest { rollout_id, spec };
         let plan = client.plan_rollout(unary(request)).await.map_err(|s| args.refused(s))?.into_inner();
-        out.one(&plan, &args.rollout_id, || told(&args.rollout_id, &args.spec().waves, &plan))?;
+        out.one(&plan, &args.rollout_id, || describe_plan(&args.rollout_id, &args.spec().waves, &plan))?;
         out.inform("a dry run: nothing was written");
         out.next("the same without --dry-run writes it down, with --start it begins");
         return Ok(());
@@ -223,8 +223,8 @@ pub async fn run(args: Create, out: &Out) -> Result<(), Exit> {
     show(&rollout, out)
 }
 
-/// A plan in words.
-pub fn told(rollout_id: &str, waves: &[v1::RolloutWave], plan: &v1::PlanRolloutResponse) -> String {
+/// Describes a plan in words.
+pub fn describe_plan(rollout_id: &str, waves: &[v1::RolloutWave], plan: &v1::PlanRolloutResponse) -> String {
     let all: u32 = plan.wave_sizes.iter().sum();
     let count = plan.wave_sizes.len() as u32;
     let mut lines = vec![format!("{rollout_id} would reach {}", text::robots(all))];

@@ -452,7 +452,7 @@ MODEL  RUNS  AREA  CAN  ROBOTS  IN WAVE 1
 h1     -     -     -    5       yes",
         offline.message
     );
-    assert_eq!(create::told("walk-1.5.0", &waves, &plan), expected);
+    assert_eq!(create::describe_plan("walk-1.5.0", &waves, &plan), expected);
 }
 
 #[derive(Parser)]

@@ -108,7 +108,7 @@ async fn ask(args: Engage, out: &Out) -> Result<(), Exit> {
     let site_id = target.site_id.clone();
     let request = v1::EngageRequest { scope, level: level.into(), reason: args.reason, request_id, site_id };
     let mut client = args.call.client(&target).await?;
-    let (mut told, mut tries) = (Told::default(), TRIES);
+    let (mut told, mut tries) = (EngageProgress::default(), TRIES);
     let mut lost_since = None;
     loop {
         let lost = match told.follow_answer(&mut client, request.clone(), args.no_wait, out).await {
@@ -150,13 +150,13 @@ enum Heard {
 
 /// What was told of one stop until now.
 #[derive(Default)]
-struct Told {
+struct EngageProgress {
     stop: v1::Stop,
     robots: BTreeMap<String, v1::RobotStop>,
     last: v1::EngageResponse,
 }
 
-impl Told {
+impl EngageProgress {
     /// Engages the stop, unless that was done, and hears of it to the end.
     async fn follow_answer(
         &mut self,
@@ -342,7 +342,7 @@ mod tests {
             v1::EngageResponse { stop: Some(stop), robot_unknown: true, nearest_robot_ids, ..Default::default() };
         let out = Out::new(Format::Name);
         for no_wait in [true, false] {
-            let mut told = Told::default();
+            let mut told = EngageProgress::default();
             told.note(first.clone(), &out).unwrap_or_else(|exit| panic!("{exit}"));
             told.note(v1::EngageResponse::default(), &out).unwrap_or_else(|exit| panic!("{exit}"));
             let exit = told.end(no_wait, &out).expect_err("nobody has confirmed it");
@@ -359,9 +359,9 @@ mod tests {
             confirmation: confirmation.into(),
             ..v1::RobotStop::default()
         };
-        let told = |level: StopLevel| Told {
+        let told = |level: StopLevel| EngageProgress {
             stop: v1::Stop { level: level.into(), ..v1::Stop::default() },
-            ..Told::default()
+            ..EngageProgress::default()
         };
         let settled = |level, confirmation| told(level).is_settled(&robot(confirmation));
         assert!(settled(StopLevel::Halt, v1::Confirmation::StandstillConfirmed));

@@ -74,8 +74,8 @@ pub async fn until_over(call: &Call, task_id: &str, told: String, timeout: Durat
     }
 }
 
-/// Says where a task is, if that is news, and gives it back.
-pub fn told_state(task_id: &str, told: &str, task: &v1::Task, out: &Out) -> String {
+/// Reports the state of a task if it has changed, and returns that state.
+pub fn report_state(task_id: &str, told: &str, task: &v1::Task, out: &Out) -> String {
     let now = format!("{} {}", state(task), task.robot_id).trim().to_owned();
     if now != told && out.format == Format::Table {
         let begin = if told.is_empty() { task_id } else { "  >" };
@@ -105,7 +105,7 @@ async fn followed(call: &Call, task_id: &str, mut told: String, out: &Out) -> Re
             }
         };
         is_known = true;
-        told = told_state(task_id, &told, &task, out);
+        told = report_state(task_id, &told, &task, out);
         use v1::TaskState::{Canceled, Expired, Failed, NeedsOperator, Succeeded};
         let is_over = matches!(task.state(), Succeeded | Failed | Canceled | Expired | NeedsOperator);
         Ok(if is_over { ControlFlow::Break(task) } else { ControlFlow::Continue(()) })

@@ -1,6 +1,6 @@
 //! `midshift task submit`: a transport, or a whole list.
 
-use super::follow::{told_state, until_over};
+use super::follow::{report_state, until_over};
 use super::shown::show;
 use crate::client::{Call, Change, Exit, unary};
 use crate::out::Out;
@@ -86,7 +86,7 @@ pub async fn run(args: Submit, out: &Out) -> Result<(), Exit> {
     robots_are_known(&args, std::iter::once(&message)).await?;
     let task = args.call.task().await?.submit_task(unary(message)).await?.into_inner().task.unwrap_or_default();
     if args.wait && !args.change.dry_run {
-        let told = told_state(&task.task_id, "", &task, out);
+        let told = report_state(&task.task_id, "", &task, out);
         return until_over(&args.call, &task.task_id, told, Duration::from_secs(86_400), out).await;
     }
     if args.change.dry_run {
