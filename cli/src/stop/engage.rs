@@ -108,17 +108,17 @@ async fn ask(args: Engage, out: &Out) -> Result<(), Exit> {
     let site_id = target.site_id.clone();
     let request = v1::EngageRequest { scope, level: level.into(), reason: args.reason, request_id, site_id };
     let mut client = args.call.client(&target).await?;
-    let (mut told, mut tries) = (EngageProgress::default(), TRIES);
+    let (mut progress, mut tries) = (EngageProgress::default(), TRIES);
     let mut lost_since = None;
     loop {
-        let lost = match told.follow_answer(&mut client, request.clone(), args.no_wait, out).await {
-            Ok(()) => return told.end(args.no_wait, out),
+        let lost = match progress.follow_answer(&mut client, request.clone(), args.no_wait, out).await {
+            Ok(()) => return progress.end(args.no_wait, out),
             Err(Heard::Failed(exit)) => return Err(exit),
             Err(Heard::Lost(status)) => status,
         };
         let lost_since: Instant = *lost_since.get_or_insert_with(Instant::now);
         if tries == 0 || lost_since.elapsed() > ASK_WITHIN {
-            return Err(told.cut(lost).or_try("midshift stop status: it may be engaged all the same"));
+            return Err(progress.cut(lost).or_try("midshift stop status: it may be engaged all the same"));
         }
         if tries == TRIES {
             out.inform("the stop service broke off before it said everything; it is asked again, for the same stop");
@@ -148,7 +148,7 @@ enum Heard {
     Lost(tonic::Status),
 }
 
-/// What was told of one stop until now.
+/// The progress of one engaged stop, as the answer has shown it until now.
 #[derive(Default)]
 struct EngageProgress {
     stop: v1::Stop,
@@ -342,10 +342,10 @@ mod tests {
             v1::EngageResponse { stop: Some(stop), robot_unknown: true, nearest_robot_ids, ..Default::default() };
         let out = Out::new(Format::Name);
         for no_wait in [true, false] {
-            let mut told = EngageProgress::default();
-            told.note(first.clone(), &out).unwrap_or_else(|exit| panic!("{exit}"));
-            told.note(v1::EngageResponse::default(), &out).unwrap_or_else(|exit| panic!("{exit}"));
-            let exit = told.end(no_wait, &out).expect_err("nobody has confirmed it");
+            let mut progress = EngageProgress::default();
+            progress.note(first.clone(), &out).unwrap_or_else(|exit| panic!("{exit}"));
+            progress.note(v1::EngageResponse::default(), &out).unwrap_or_else(|exit| panic!("{exit}"));
+            let exit = progress.end(no_wait, &out).expect_err("nobody has confirmed it");
             assert_eq!(exit.code(), NOT_ALL);
             let said = exit.to_string();
             assert!(said.contains("no robot rbt-4 is known") && said.contains("There is rbt-04, rbt-14"), "{said}");
@@ -359,11 +359,11 @@ mod tests {
             confirmation: confirmation.into(),
             ..v1::RobotStop::default()
         };
-        let told = |level: StopLevel| EngageProgress {
+        let progress = |level: StopLevel| EngageProgress {
             stop: v1::Stop { level: level.into(), ..v1::Stop::default() },
             ..EngageProgress::default()
         };
-        let settled = |level, confirmation| told(level).is_settled(&robot(confirmation));
+        let settled = |level, confirmation| progress(level).is_settled(&robot(confirmation));
         assert!(settled(StopLevel::Halt, v1::Confirmation::StandstillConfirmed));
         assert!(settled(StopLevel::Halt, v1::Confirmation::Outside));
         assert!(
@@ -371,7 +371,7 @@ mod tests {
         );
         assert!(!settled(StopLevel::Halt, v1::Confirmation::Unreachable));
         let elsewhere = v1::RobotStop { elsewhere: true, ..robot(v1::Confirmation::Unreachable) };
-        assert!(told(StopLevel::Halt).is_settled(&elsewhere), "it said so, and obeys the stop wherever it drives");
+        assert!(progress(StopLevel::Halt).is_settled(&elsewhere), "it said so, and obeys the stop wherever it drives");
         let text = confirmed(&v1::RobotStop {
             unreachable_since_unix_ms: 1_000,
             self_stop_by_unix_ms: 7_000,
