@@ -1,12 +1,12 @@
 //! `midshift robot …`
 
 mod adopt;
-mod one;
 mod software;
 mod table;
+mod target;
 
-pub use one::{One, find};
 pub use table::controls;
+pub use target::{RobotTarget, find};
 
 use super::client::{Call, Change, Exit, Guarded, follow, unary};
 use super::enrol::{self, Machine};
@@ -33,7 +33,7 @@ pub enum Verb {
         call: Call,
     },
     /// Show one robot: live state and what was decided about it.
-    Get(One),
+    Get(RobotTarget),
     /// Follow the live state of robots.
     Watch {
         #[command(flatten)]
@@ -45,7 +45,7 @@ pub enum Verb {
         period: Duration,
     },
     /// Why a robot has no work.
-    Explain(One),
+    Explain(RobotTarget),
     /// No new work; what it does now, it finishes.
     Cordon(Order),
     /// Back to work; also resets the breaker.
@@ -88,7 +88,7 @@ pub enum Verb {
     /// Keep it at the software that it runs.
     Pin {
         #[command(flatten)]
-        one: One,
+        one: RobotTarget,
         /// Why it is kept there, for the audit.
         #[arg(long)]
         reason: String,
@@ -98,14 +98,14 @@ pub enum Verb {
     /// Let it take part in roll-outs again.
     Unpin {
         #[command(flatten)]
-        one: One,
+        one: RobotTarget,
         #[command(flatten)]
         change: Change,
     },
     /// Tell a robot that could not go back from a bundle to do so once more: you mended what kept it.
     Unstick {
         #[command(flatten)]
-        one: One,
+        one: RobotTarget,
         /// What you mended.
         #[arg(long)]
         reason: String,
@@ -140,7 +140,7 @@ pub enum Verb {
     /// Take the robot's key out: it is cut off, and let in nowhere until it is enrolled anew.
     Revoke {
         #[command(flatten)]
-        one: One,
+        one: RobotTarget,
         /// Why, for the audit.
         #[arg(long, default_value = "")]
         reason: String,
@@ -153,7 +153,7 @@ pub enum Verb {
     /// Leave it out of a roll-out that did not take it out of work yet.
     Exclude {
         #[command(flatten)]
-        one: One,
+        one: RobotTarget,
         /// Of which roll-out.
         #[arg(long, value_name = "ROLLOUT_ID")]
         from: String,
@@ -169,7 +169,7 @@ pub enum Verb {
 #[derive(clap::Args)]
 pub struct Bare {
     #[command(flatten)]
-    one: One,
+    one: RobotTarget,
     #[command(flatten)]
     guarded: Guarded,
 }
@@ -178,7 +178,7 @@ pub struct Bare {
 #[derive(clap::Args)]
 pub struct Order {
     #[command(flatten)]
-    one: One,
+    one: RobotTarget,
     /// Why: what you saw, or what it is for.
     #[arg(long)]
     reason: String,
@@ -188,7 +188,7 @@ pub struct Order {
 
 impl Verb {
     /// The one robot that it is about, of those that the server has heard of.
-    fn one(&mut self) -> Option<&mut One> {
+    fn one(&mut self) -> Option<&mut RobotTarget> {
         match self {
             Self::Get(one) | Self::Explain(one) => Some(one),
             Self::Cordon(Order { one, .. }) | Self::Retire(Order { one, .. }) => Some(one),
@@ -350,7 +350,7 @@ fn beacon_line(beacon: &v1::Beacon) -> String {
     )
 }
 
-async fn get(one: &One, out: &Out) -> Result<(), Exit> {
+async fn get(one: &RobotTarget, out: &Out) -> Result<(), Exit> {
     let request = v1::GetRobotRequest { robot_id: one.robot_id.clone() };
     let answer = one.call.telemetry().await?.get_robot(unary(request)).await?.into_inner();
     let robot = answer.robot.unwrap_or_default();
@@ -401,7 +401,7 @@ async fn watch(call: &Call, robot_ids: Vec<String>, period: Duration, out: &Out)
     follow(out, open, take).await
 }
 
-async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
+async fn explain(one: &RobotTarget, out: &Out) -> Result<(), Exit> {
     let request = fleet::ExplainRobotRequest { robot_id: one.robot_id.clone() };
     let answer = one.call.fleet().await?.explain_robot(unary(request)).await?.into_inner();
     let e = answer.explanation.clone().unwrap_or_default();

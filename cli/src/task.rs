@@ -2,10 +2,10 @@
 
 mod follow;
 mod many;
-mod one;
 mod resume;
 mod shown;
 mod submit;
+mod target;
 
 pub use resume::Resume;
 
@@ -16,10 +16,10 @@ use super::zone;
 use clap::Subcommand;
 use follow::{until_over, watch};
 use midshift_proto::task::v1;
-use one::{As, Meant, One, Which};
 use shown::{priority, show, state, waypoints};
 use std::time::Duration;
 use submit::Submit;
+use target::{Answer, TargetTasks, TaskSelection, TaskTarget};
 use tonic::Code;
 
 /// How far a long search is, is said after so many tasks each.
@@ -33,7 +33,7 @@ pub enum Verb {
     /// List tasks, newest first.
     Ls(List),
     /// Show one task with its attempts.
-    Get(One),
+    Get(TaskTarget),
     /// Follow changes of tasks.
     Watch {
         #[command(flatten)]
@@ -47,17 +47,17 @@ pub enum Verb {
     /// Wait until a task is over.
     Wait {
         #[command(flatten)]
-        one: One,
+        one: TaskTarget,
         /// Give up after this (exit code 10).
         #[arg(long, value_parser = super::duration, default_value = "1h")]
         timeout: Duration,
     },
     /// Why a task is not running.
-    Explain(One),
+    Explain(TaskTarget),
     /// End a task, or with --all every one that is meant.
     Cancel {
         #[command(flatten)]
-        which: Which,
+        which: TaskSelection,
         /// Why it is to end.
         #[arg(long)]
         reason: String,
@@ -70,10 +70,10 @@ pub enum Verb {
     /// Answer a task that needs an operator, or with --all every one that is meant.
     Resolve {
         #[command(flatten)]
-        which: Which,
+        which: TaskSelection,
         /// What is to become of it.
         #[arg(long = "as", value_enum)]
-        resolution: As,
+        resolution: Answer,
         /// What you saw or did.
         #[arg(long)]
         reason: String,
@@ -93,7 +93,7 @@ pub struct List {
     #[command(flatten)]
     call: Call,
     #[command(flatten)]
-    meant: Meant,
+    meant: TargetTasks,
     /// At most so many, 1..1000.
     #[arg(long, default_value_t = 100)]
     limit: u32,
@@ -143,8 +143,8 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
 }
 
 async fn resolve(
-    one: One,
-    resolution: As,
+    one: TaskTarget,
+    resolution: Answer,
     reason: String,
     if_match: String,
     change: Change,
@@ -190,7 +190,7 @@ async fn list(args: List, out: &Out) -> Result<(), Exit> {
     Ok(())
 }
 
-async fn get(one: &One, out: &Out) -> Result<(), Exit> {
+async fn get(one: &TaskTarget, out: &Out) -> Result<(), Exit> {
     let answer = one.read().await?;
     let task = answer.task.clone().unwrap_or_default();
     out.one(&answer, &task.task_id, || {
@@ -199,7 +199,7 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
         if let Some(reason) = &task.reason {
             text += &format!("  {}: {}\n", reason.code, plain(&reason.message));
         }
-        let allowed = task.allowed_resolutions().filter_map(As::word).collect::<Vec<_>>().join(", ");
+        let allowed = task.allowed_resolutions().filter_map(Answer::word).collect::<Vec<_>>().join(", ");
         if !allowed.is_empty() {
             text += &format!(
                 "  a person may answer: midshift task resolve {} --as {allowed} --reason TEXT\n",
@@ -221,7 +221,7 @@ async fn get(one: &One, out: &Out) -> Result<(), Exit> {
     Ok(())
 }
 
-async fn explain(one: &One, out: &Out) -> Result<(), Exit> {
+async fn explain(one: &TaskTarget, out: &Out) -> Result<(), Exit> {
     let task_id = one.find().await?;
     let request = midshift_proto::fleet::v1::ExplainTaskRequest { task_id: task_id.clone() };
     let answer = match one.call.fleet().await?.explain_task(unary(request)).await {

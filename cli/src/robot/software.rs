@@ -1,6 +1,6 @@
 //! `midshift robot pin|unpin|unstick`, and what is shown of a robot's software.
 
-use super::one::One;
+use super::target::RobotTarget;
 use crate::client::{Change, Exit, ended, unary};
 use crate::out::{Out, plain};
 use midshift_proto::ota::v1;
@@ -25,18 +25,18 @@ macro_rules! command {
 }
 
 /// Keeps a robot at the software that it runs.
-pub async fn pin(one: &One, reason: String, change: Change, out: &Out) -> Result<(), Exit> {
+pub async fn pin(one: &RobotTarget, reason: String, change: Change, out: &Out) -> Result<(), Exit> {
     let next = format!("midshift robot unpin {}", one.robot_id);
     command!(one, change, out, pin_robot, PinRobotRequest { reason }, &next)
 }
 
 /// Lets a pinned robot take part in roll-outs again.
-pub async fn unpin(one: &One, change: Change, out: &Out) -> Result<(), Exit> {
+pub async fn unpin(one: &RobotTarget, change: Change, out: &Out) -> Result<(), Exit> {
     command!(one, change, out, unpin_robot, UnpinRobotRequest {}, "")
 }
 
 /// Tells a robot that could not go back from a bundle to do so once more.
-pub async fn unstick(one: &One, reason: String, change: Change, out: &Out) -> Result<(), Exit> {
+pub async fn unstick(one: &RobotTarget, reason: String, change: Change, out: &Out) -> Result<(), Exit> {
     let next = format!("midshift robot get {}", one.robot_id);
     command!(one, change, out, unstick_robot, UnstickRobotRequest { reason }, &next)
 }

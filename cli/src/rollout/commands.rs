@@ -1,6 +1,6 @@
 //! What is asked of the service of roll-outs: a change of one, or of a robot in one.
 
-use super::one::One;
+use super::target::RolloutTarget;
 use super::text;
 use crate::client::{Call, Change, Exit, ended, unary};
 use crate::endpoint::Line;
@@ -97,7 +97,13 @@ pub async fn exclude(
 }
 
 /// Counts a lost robot in no budget.
-pub async fn write_off(one: One, robot_id: String, reason: String, change: Change, out: &Out) -> Result<(), Exit> {
+pub async fn write_off(
+    one: RolloutTarget,
+    robot_id: String,
+    reason: String,
+    change: Change,
+    out: &Out,
+) -> Result<(), Exit> {
     about_robot!(write_off_robot, WriteOffRobotRequest, one.call, one.rollout_id, robot_id, reason, change, out)
 }
 

@@ -2,7 +2,7 @@
 //!
 //! Invariant: nothing is asked again and again; the server sends each change.
 
-use super::one::One;
+use super::target::RolloutTarget;
 use super::text;
 use crate::client::{Exit, follow};
 use crate::out::{Format, Out};
@@ -129,14 +129,14 @@ pub fn end(rollout: &v1::Rollout, until: Until) -> Option<Result<(), Exit>> {
     }
 }
 
-async fn messages(one: &One, countdowns: Countdowns) -> Result<Streaming<v1::WatchRolloutResponse>, Exit> {
+async fn messages(one: &RolloutTarget, countdowns: Countdowns) -> Result<Streaming<v1::WatchRolloutResponse>, Exit> {
     let counts_down = countdowns == Countdowns::Shown;
     let request = v1::WatchRolloutRequest { rollout_id: one.rollout_id.clone(), counts_down };
     Ok(one.call.rollouts().await?.watch_rollout(request).await.map_err(Exit::with_facts)?.into_inner())
 }
 
 /// Follows to the end.
-pub async fn watch(one: &One, out: &Out) -> Result<(), Exit> {
+pub async fn watch(one: &RolloutTarget, out: &Out) -> Result<(), Exit> {
     let mut picture = Picture::default();
     let is_live = out.format == Format::Table && std::io::stdout().is_terminal();
     let countdowns = if is_live { Countdowns::Shown } else { Countdowns::NotShown };
@@ -176,7 +176,7 @@ pub async fn watch(one: &One, out: &Out) -> Result<(), Exit> {
 }
 
 /// Waits for an end.
-pub async fn wait(one: &One, until: Until, timeout: Duration, out: &Out) -> Result<(), Exit> {
+pub async fn wait(one: &RolloutTarget, until: Until, timeout: Duration, out: &Out) -> Result<(), Exit> {
     let id = &one.rollout_id;
     let (rollout, end) = tokio::time::timeout(timeout, until_end(one, until, out)).await.map_err(|_| {
         Exit::new(10, format!("{id} has not ended after {timeout:?}\n  try: midshift rollout get {id} --robots"))
@@ -185,7 +185,7 @@ pub async fn wait(one: &One, until: Until, timeout: Duration, out: &Out) -> Resu
     end
 }
 
-async fn until_end(one: &One, until: Until, out: &Out) -> Result<(v1::Rollout, Result<(), Exit>), Exit> {
+async fn until_end(one: &RolloutTarget, until: Until, out: &Out) -> Result<(v1::Rollout, Result<(), Exit>), Exit> {
     let take = |message: Option<v1::WatchRolloutResponse>| {
         let rollout = message.and_then(|m| m.rollout).unwrap_or_default();
         Ok(end(&rollout, until).map_or(ControlFlow::Continue(()), |end| ControlFlow::Break((rollout, end))))

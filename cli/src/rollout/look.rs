@@ -1,7 +1,7 @@
 //! Reading roll-outs: lists, one of them, its robots, what one robot waits for, what happened.
 
 use super::commands::Client;
-use super::one::One;
+use super::target::RolloutTarget;
 use super::text;
 use crate::client::{Call, Exit, unary};
 use crate::out::{Format, Out, columns, plain};
@@ -87,7 +87,7 @@ impl Listed for v1::RolloutRobot {
 }
 
 /// Lists robots of one.
-pub async fn robots(one: &One, out: &Out) -> Result<(), Exit> {
+pub async fn robots(one: &RolloutTarget, out: &Out) -> Result<(), Exit> {
     let whole = members(&mut one.call.rollouts().await?, &one.rollout_id, "").await?;
     out.list(&whole)?;
     out.next(&format!("midshift rollout explain {} ROBOT", one.rollout_id));
@@ -95,7 +95,7 @@ pub async fn robots(one: &One, out: &Out) -> Result<(), Exit> {
 }
 
 /// Shows one.
-pub async fn get(one: &One, robots: bool, out: &Out) -> Result<(), Exit> {
+pub async fn get(one: &RolloutTarget, robots: bool, out: &Out) -> Result<(), Exit> {
     let rollout = one.read().await?;
     let whole = members(&mut one.call.rollouts().await?, &one.rollout_id, "").await?;
     match (out.format, robots) {
@@ -138,7 +138,7 @@ pub fn whole_text(rollout: &v1::Rollout, members: &[v1::RolloutRobot], robots: b
 }
 
 /// What one robot waits for, or why it is not in it.
-pub async fn explain(one: &One, robot_id: &str, out: &Out) -> Result<(), Exit> {
+pub async fn explain(one: &RolloutTarget, robot_id: &str, out: &Out) -> Result<(), Exit> {
     let rollout = one.read().await?;
     let mut client = one.call.rollouts().await?;
     let found = members(&mut client, &one.rollout_id, robot_id).await?.robots;
@@ -157,7 +157,7 @@ pub async fn explain(one: &One, robot_id: &str, out: &Out) -> Result<(), Exit> {
 }
 
 /// What each robot waits for that waits for anything.
-pub async fn explain_all(one: &One, out: &Out) -> Result<(), Exit> {
+pub async fn explain_all(one: &RolloutTarget, out: &Out) -> Result<(), Exit> {
     let rollout = one.read().await?;
     let mut whole = members(&mut one.call.rollouts().await?, &one.rollout_id, "").await?;
     whole.robots.retain(|robot| robot.blocked_by.is_some());
@@ -242,7 +242,7 @@ pub struct Event {
 }
 
 /// What happened, as far as rows say it.
-pub async fn history(one: &One, out: &Out) -> Result<(), Exit> {
+pub async fn history(one: &RolloutTarget, out: &Out) -> Result<(), Exit> {
     let rollout = one.read().await?;
     let robots = members(&mut one.call.rollouts().await?, &one.rollout_id, "").await?.robots;
     let events = events(&rollout, &robots);

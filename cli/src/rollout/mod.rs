@@ -7,15 +7,15 @@ mod commands;
 mod create;
 mod follow;
 mod look;
-mod one;
 mod parse;
 mod report;
+mod target;
 #[cfg(test)]
 mod tests;
 mod text;
 
 pub use commands::exclude;
-pub use one::{One, find};
+pub use target::{RolloutTarget, find};
 
 use super::client::{Call, Change, Exit, unary};
 use super::out::Out;
@@ -32,29 +32,29 @@ pub enum Verb {
     /// Write a roll-out down, or only tell what it would do; or write it down and begin.
     Create(Box<create::Create>),
     /// Check it against the fleet as it is now.
-    Submit(Said),
+    Submit(RolloutWithReason),
     /// Stand for it. Until there is a login whoever wrote it may do so.
-    Approve(Said),
+    Approve(RolloutWithReason),
     /// Begin: robots of the first wave fetch the bundle while they work.
     Start {
         #[command(flatten)]
-        said: Said,
+        target: RolloutWithReason,
         /// Abort roll-outs that have some of the robots first.
         #[arg(long)]
         supersede: bool,
     },
     /// Stand still: no robot is taken out of work, none may activate. A permission that was given lives for 5 s more.
-    Pause(Said),
+    Pause(RolloutWithReason),
     /// Go on.
-    Resume(Seen),
+    Resume(RolloutWithEtag),
     /// Go on with the next wave though the gate did not say so.
-    Promote(Seen),
+    Promote(RolloutWithEtag),
     /// End it; robots that it touched go back.
-    Abort(Seen),
+    Abort(RolloutWithEtag),
     /// Take a completed roll-out back with another: its robots go back to what they kept.
     Rollback {
         #[command(flatten)]
-        one: One,
+        one: RolloutTarget,
         /// Id of the one that takes it back, never used before.
         #[arg(long = "as", value_name = "NEW_ID")]
         new_id: String,
@@ -65,7 +65,7 @@ pub enum Verb {
     /// Once more with robots of a completed roll-out, one by one; their quarantine is lifted.
     Retry {
         #[command(flatten)]
-        said: Said,
+        target: RolloutWithReason,
         /// With those that failed or were skipped: nobody else can be tried again.
         #[arg(long, required = true)]
         failed: bool,
@@ -73,7 +73,7 @@ pub enum Verb {
     /// Leave a robot out that was not taken out of work yet.
     Exclude {
         #[command(flatten)]
-        one: One,
+        one: RolloutTarget,
         /// The robot that is left out.
         robot_id: String,
         /// Why it is left out, for the audit.
@@ -85,7 +85,7 @@ pub enum Verb {
     /// Say that a robot that is lost will not come back: it counts in no budget until it is heard, and keeps its drain.
     WriteOff {
         #[command(flatten)]
-        one: One,
+        one: RolloutTarget,
         /// The robot that will not come back.
         robot_id: String,
         /// Why it is given up, for the audit.
@@ -102,30 +102,30 @@ pub enum Verb {
     /// Show one: where it is, its waves, what its gates said.
     Get {
         #[command(flatten)]
-        one: One,
+        one: RolloutTarget,
         /// Each robot too.
         #[arg(long)]
         robots: bool,
     },
     /// List its robots: how far each is and what it waits for.
-    Robots(One),
+    Robots(RolloutTarget),
     /// What each robot waits for in it, since when, until when, and what a person can do; of one robot also why it was left out.
     Explain {
         #[command(flatten)]
-        one: One,
+        one: RolloutTarget,
         /// Only this robot.
         robot_id: Option<String>,
     },
     /// What happened, in order: what people did, what gates said, where each robot came to last.
-    History(One),
+    History(RolloutTarget),
     /// Its whole record as one document, with -o json or -o html: who, what, when, verdicts, each robot's outcome, tasks done meanwhile.
-    Report(One),
+    Report(RolloutTarget),
     /// Follow it to its end: a live picture on a terminal, else a line for each change.
-    Watch(One),
+    Watch(RolloutTarget),
     /// Wait until it has ended, or needs a person.
     Wait {
         #[command(flatten)]
-        one: One,
+        one: RolloutTarget,
         /// For what.
         #[arg(long = "for", value_enum, default_value_t = Until::Completed)]
         until: Until,
@@ -137,13 +137,13 @@ pub enum Verb {
 
 impl Verb {
     /// The one roll-out that it is about, and the one robot in it.
-    fn named(&mut self) -> (Option<&mut One>, Option<&mut String>) {
+    fn named(&mut self) -> (Option<&mut RolloutTarget>, Option<&mut String>) {
         match self {
             Self::Exclude { one, robot_id, .. } | Self::WriteOff { one, robot_id, .. } => (Some(one), Some(robot_id)),
             Self::Explain { one, robot_id } => (Some(one), robot_id.as_mut()),
-            Self::Submit(said) | Self::Approve(said) | Self::Pause(said) => (Some(&mut said.one), None),
-            Self::Start { said, .. } | Self::Retry { said, .. } => (Some(&mut said.one), None),
-            Self::Resume(seen) | Self::Promote(seen) | Self::Abort(seen) => (Some(&mut seen.said.one), None),
+            Self::Submit(target) | Self::Approve(target) | Self::Pause(target) => (Some(&mut target.one), None),
+            Self::Start { target, .. } | Self::Retry { target, .. } => (Some(&mut target.one), None),
+            Self::Resume(target) | Self::Promote(target) | Self::Abort(target) => (Some(&mut target.target.one), None),
             Self::Rollback { one, .. } | Self::Get { one, .. } | Self::Wait { one, .. } => (Some(one), None),
             Self::Robots(one) | Self::History(one) | Self::Report(one) | Self::Watch(one) => (Some(one), None),
             Self::Create(_) | Self::Ls { .. } => (None, None),
@@ -157,9 +157,9 @@ impl Verb {
 
 /// One roll-out and why.
 #[derive(clap::Args)]
-pub struct Said {
+pub struct RolloutWithReason {
     #[command(flatten)]
-    one: One,
+    one: RolloutTarget,
     /// Why; shown to people.
     #[arg(long, default_value = "")]
     reason: String,
@@ -167,9 +167,9 @@ pub struct Said {
 
 /// One roll-out as it was seen.
 #[derive(clap::Args)]
-pub struct Seen {
+pub struct RolloutWithEtag {
     #[command(flatten)]
-    said: Said,
+    target: RolloutWithReason,
     /// The etag you saw; without it the roll-out is read first.
     #[arg(long, visible_alias = "etag", default_value = "")]
     if_match: String,
@@ -185,15 +185,15 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
     }
     match verb {
         Verb::Create(args) => create::run(*args, out).await,
-        Verb::Submit(said) => act(&said, Ask::Submit, out).await,
-        Verb::Approve(said) => act(&said, Ask::Approve, out).await,
-        Verb::Start { said, supersede } => act(&said, Ask::Start { supersede }, out).await,
-        Verb::Pause(said) => act(&said, Ask::Pause, out).await,
-        Verb::Resume(seen) => act_on(&seen, Ask::Resume, out).await,
-        Verb::Promote(seen) => act_on(&seen, Ask::Promote, out).await,
-        Verb::Abort(seen) => act_on(&seen, Ask::Abort, out).await,
+        Verb::Submit(target) => act(&target, Ask::Submit, out).await,
+        Verb::Approve(target) => act(&target, Ask::Approve, out).await,
+        Verb::Start { target, supersede } => act(&target, Ask::Start { supersede }, out).await,
+        Verb::Pause(target) => act(&target, Ask::Pause, out).await,
+        Verb::Resume(target) => act_on(&target, Ask::Resume, out).await,
+        Verb::Promote(target) => act_on(&target, Ask::Promote, out).await,
+        Verb::Abort(target) => act_on(&target, Ask::Abort, out).await,
         Verb::Rollback { one, new_id, start } => roll_back(&one, new_id, start, out).await,
-        Verb::Retry { said, failed: _ } => act(&said, Ask::Retry, out).await,
+        Verb::Retry { target, failed: _ } => act(&target, Ask::Retry, out).await,
         Verb::Exclude { one, robot_id, reason, change } => {
             exclude(&one.call, one.rollout_id, robot_id, reason, change, out).await
         }
@@ -212,20 +212,20 @@ pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
     }
 }
 
-async fn act(said: &Said, what: Ask, out: &Out) -> Result<(), Exit> {
-    let mut client = said.one.call.rollouts().await?;
-    show(&ask(&mut client, what, &said.one.rollout_id, "", &said.reason).await?, out)
+async fn act(target: &RolloutWithReason, what: Ask, out: &Out) -> Result<(), Exit> {
+    let mut client = target.one.call.rollouts().await?;
+    show(&ask(&mut client, what, &target.one.rollout_id, "", &target.reason).await?, out)
 }
 
 /// Of verbs that judge: what is judged must be what was seen.
-async fn act_on(seen: &Seen, what: Ask, out: &Out) -> Result<(), Exit> {
-    let Said { one, reason } = &seen.said;
-    let etag = if seen.if_match.is_empty() { one.read().await?.etag } else { seen.if_match.clone() };
+async fn act_on(target: &RolloutWithEtag, what: Ask, out: &Out) -> Result<(), Exit> {
+    let RolloutWithReason { one, reason } = &target.target;
+    let etag = if target.if_match.is_empty() { one.read().await?.etag } else { target.if_match.clone() };
     let mut client = one.call.rollouts().await?;
     show(&ask(&mut client, what, &one.rollout_id, &etag, reason).await?, out)
 }
 
-async fn roll_back(one: &One, new_rollout_id: String, start: bool, out: &Out) -> Result<(), Exit> {
+async fn roll_back(one: &RolloutTarget, new_rollout_id: String, start: bool, out: &Out) -> Result<(), Exit> {
     let mut client = one.call.rollouts().await?;
     let request = v1::RollBackRolloutRequest { rollout_id: one.rollout_id.clone(), new_rollout_id };
     let answer = client.roll_back_rollout(unary(request)).await.map_err(Exit::with_facts)?;

@@ -5,7 +5,7 @@
 //! text in it.
 
 use super::look::{events, members, whole_text};
-use super::one::One;
+use super::target::RolloutTarget;
 use super::text;
 use crate::client::Exit;
 use crate::out::{Format, Out};
@@ -18,7 +18,7 @@ const STYLE: &str = "body{font:15px/1.4 sans-serif;margin:2em;max-width:80em}tab
     th,td{border:1px solid #bbb;padding:.2em .6em;text-align:left;vertical-align:top}th{background:#eee}";
 
 /// Reads one roll-out with all its robots and writes the document.
-pub async fn run(one: &One, out: &Out) -> Result<(), Exit> {
+pub async fn run(one: &RolloutTarget, out: &Out) -> Result<(), Exit> {
     let rollout = one.read().await?;
     let robots = members(&mut one.call.rollouts().await?, &one.rollout_id, "").await?.robots;
     match out.format {

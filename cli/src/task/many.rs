@@ -1,6 +1,6 @@
 //! `midshift task cancel|resolve --all`: pages of requests until nobody is meant any more.
 
-use super::one::Which;
+use super::target::TaskSelection;
 use crate::client::{Change, Exit, unary};
 use crate::out::Out;
 use midshift_proto::task::v1;
@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use tonic::Status;
 
 /// Ends every task that is meant.
-pub async fn cancel(which: &Which, reason: &str, force: bool, change: &Change, out: &Out) -> Result<(), Exit> {
+pub async fn cancel(which: &TaskSelection, reason: &str, force: bool, change: &Change, out: &Out) -> Result<(), Exit> {
     let mut client = which.call.task().await?;
     let request = v1::CancelTasksRequest {
         filter: Some(which.meant.filter()?),
@@ -28,7 +28,7 @@ pub async fn cancel(which: &Which, reason: &str, force: bool, change: &Change, o
 
 /// Answers every task that is meant.
 pub async fn resolve(
-    which: &Which,
+    which: &TaskSelection,
     resolution: v1::Resolution,
     reason: &str,
     change: &Change,

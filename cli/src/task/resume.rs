@@ -2,7 +2,7 @@
 //!
 //! Invariant: a name of a stop is looked up among those that hold robots. None of these names begins another one, so what one alone begins with is that one.
 
-use super::one::One;
+use super::target::TaskTarget;
 use crate::client::{Call, Change, Exit, unary};
 use crate::lookup::{self, Found, whole_id};
 use crate::out::Out;
@@ -47,7 +47,7 @@ impl Resume {
             *id = robot::find(&call, id).await?;
         }
         for id in &mut task_ids {
-            *id = One { call: call.clone(), task_id: std::mem::take(id) }.find().await?;
+            *id = TaskTarget { call: call.clone(), task_id: std::mem::take(id) }.find().await?;
         }
         let request = v1::ResumeHeldRequest {
             stop_id,

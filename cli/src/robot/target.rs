@@ -1,4 +1,4 @@
-//! One robot that a person names.
+//! Finds the robot that a person names.
 
 use super::table::presence;
 use crate::client::{Call, Exit, unary};
@@ -7,7 +7,7 @@ use midshift_proto::telemetry::v1;
 
 /// One robot.
 #[derive(clap::Args)]
-pub struct One {
+pub struct RobotTarget {
     /// Of which server.
     #[command(flatten)]
     pub call: Call,

@@ -1,4 +1,4 @@
-//! One roll-out that a person names.
+//! Finds the roll-out that a person names.
 
 use crate::client::{Call, Exit, unary};
 use crate::lookup::{self, Found, whole_id};
@@ -7,7 +7,7 @@ use midshift_proto::ota::v1;
 
 /// One roll-out.
 #[derive(clap::Args)]
-pub struct One {
+pub struct RolloutTarget {
     /// Of which server.
     #[command(flatten)]
     pub call: Call,
@@ -15,7 +15,7 @@ pub struct One {
     pub rollout_id: String,
 }
 
-impl One {
+impl RolloutTarget {
     /// As it is now.
     pub async fn read(&self) -> Result<v1::Rollout, Exit> {
         let request = v1::GetRolloutRequest { rollout_id: self.rollout_id.clone() };

@@ -1,4 +1,4 @@
-//! Which task a person means, which of many, and what may be answered.
+//! Finds the task or the tasks that a person names, and says what may be answered.
 
 use super::shown::{state, waypoints};
 use crate::client::{Call, Exit, unary};
@@ -9,7 +9,7 @@ use tonic::Code;
 
 /// One task.
 #[derive(clap::Args)]
-pub struct One {
+pub struct TaskTarget {
     /// Of which server.
     #[command(flatten)]
     pub call: Call,
@@ -19,7 +19,7 @@ pub struct One {
 
 /// One task, or many.
 #[derive(clap::Args)]
-pub struct Which {
+pub struct TaskSelection {
     /// Of which server.
     #[command(flatten)]
     pub call: Call,
@@ -31,12 +31,12 @@ pub struct Which {
     all: bool,
     /// Of all tasks, those that are meant.
     #[command(flatten)]
-    pub meant: Meant,
+    pub meant: TargetTasks,
 }
 
 /// Which tasks are meant.
 #[derive(clap::Args)]
-pub struct Meant {
+pub struct TargetTasks {
     /// Only these states, e.g. needs-operator.
     #[arg(long)]
     state: Vec<String>,
@@ -51,14 +51,14 @@ pub struct Meant {
     external_ref: String,
 }
 
-impl Which {
+impl TaskSelection {
     /// The one task; none: many are meant.
-    pub fn one(&self) -> Option<One> {
-        self.task_id.clone().map(|task_id| One { call: self.call.clone(), task_id })
+    pub fn one(&self) -> Option<TaskTarget> {
+        self.task_id.clone().map(|task_id| TaskTarget { call: self.call.clone(), task_id })
     }
 }
 
-impl Meant {
+impl TargetTasks {
     /// As the server reads it.
     pub fn filter(&self) -> Result<v1::TaskFilter, Exit> {
         let mut states = Vec::new();
@@ -78,7 +78,7 @@ impl Meant {
     }
 }
 
-impl One {
+impl TaskTarget {
     /// The whole id behind a prefix. A whole id is always itself, however many others begin with it.
     pub async fn find(&self) -> Result<String, Exit> {
         if self.task_id.is_empty() {
@@ -107,7 +107,7 @@ impl One {
 
 /// Answers to NEEDS_OPERATOR.
 #[derive(Clone, Copy, ValueEnum)]
-pub enum As {
+pub enum Answer {
     /// Try again.
     Requeue,
     /// Try again; the item was handed to another robot.
@@ -124,7 +124,7 @@ pub enum As {
     Canceled,
 }
 
-impl As {
+impl Answer {
     /// The word for an answer on the wire, as `--as` takes it.
     pub fn word(answer: v1::Resolution) -> Option<String> {
         let known = Self::value_variants().iter().find(|word| word.wire() == answer)?;
@@ -151,8 +151,8 @@ mod tests {
         use clap::ValueEnum;
         for number in 1.. {
             let Ok(answer) = super::v1::Resolution::try_from(number) else { break };
-            let word = super::As::word(answer).expect("a word");
-            assert_eq!(super::As::from_str(&word, false).map(super::As::wire), Ok(answer), "{word}");
+            let word = super::Answer::word(answer).expect("a word");
+            assert_eq!(super::Answer::from_str(&word, false).map(super::Answer::wire), Ok(answer), "{word}");
         }
     }
 }
