@@ -6,7 +6,7 @@
 pub mod access;
 pub mod chunk;
 pub mod convert;
-pub mod denying;
+pub mod denials;
 mod generated;
 pub mod json;
 pub mod leaving;
@@ -21,7 +21,7 @@ mod secrets {
 }
 
 pub use convert::{Parse, parse, parse_field, parse_word};
-pub use denying::Denying;
+pub use denials::DenialReporter;
 pub use generated::{common, fleet, identity, link, ota, sim, stop, task, telemetry};
 pub use leaving::Leaving;
 pub use status::{refusal_of, status};

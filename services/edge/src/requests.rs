@@ -22,8 +22,8 @@ use midshift_core::overload::Class;
 use midshift_core::overload::bugs::Bugs;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::{Boxed, limits};
-use midshift_proto::denying::Told;
-use midshift_proto::{Denying, access};
+use midshift_proto::denials::DenialSink;
+use midshift_proto::{DenialReporter, access};
 use std::convert::Infallible;
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -197,12 +197,12 @@ impl Door {
         report_denial(self.rules.port, self.denials.as_deref(), key, actor, from, path, refusal);
     }
 
-    /// For a service that denies what only it can judge.
-    fn denying(&self, caller: &Caller, uri: &Uri) -> Denying {
-        let Some(denials) = self.denials.clone() else { return Denying::default() };
+    /// The reporter for a service that denies what only it can judge.
+    fn denial_reporter(&self, caller: &Caller, uri: &Uri) -> DenialReporter {
+        let Some(denials) = self.denials.clone() else { return DenialReporter::default() };
         let key = QuotaKey::from_caller(Ok(caller), self.peer.address.ip());
         let (port, from, caller) = (self.rules.port, network(self.peer.address.ip()), caller.clone());
-        Denying::new(Arc::new(Inward { port, denials, key, caller, from, uri: uri.clone() }))
+        DenialReporter::new(Arc::new(PortDenials { port, denials, key, caller, from, uri: uri.clone() }))
     }
 }
 
@@ -222,8 +222,8 @@ fn report_denial(
     }
 }
 
-/// One request that the port let in, for whoever denies it then.
-struct Inward {
+/// Records denials of one request that the port let in.
+struct PortDenials {
     port: &'static str,
     denials: Arc<Denials>,
     key: QuotaKey,
@@ -232,7 +232,7 @@ struct Inward {
     uri: Uri,
 }
 
-impl Told for Inward {
+impl DenialSink for PortDenials {
     fn denied(&self, refusal: &Refusal) {
         let (port, reason) = (self.port, refusal.reason.code.as_str());
         metrics::counter!("midshift_edge_requests_denied_inside_total", "port" => port, "reason" => reason)
@@ -264,8 +264,8 @@ impl HyperService<Request<Incoming>> for Door {
         };
         request.extensions_mut().insert(self.peer.clone());
         request.extensions_mut().insert(self.peer.leaving.clone());
-        let denying = self.denying(&caller, request.uri());
-        request.extensions_mut().insert(denying);
+        let reporter = self.denial_reporter(&caller, request.uri());
+        request.extensions_mut().insert(reporter);
         request.extensions_mut().insert(caller);
         let head = deadline.map_or(now + self.rules.head, |deadline| deadline.min(now + self.rules.head));
         let answer = (self.services)(request.map(Body::new));

@@ -11,7 +11,7 @@ use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::time::Utc;
-use midshift_proto::Denying;
+use midshift_proto::DenialReporter;
 use midshift_proto::access::caller;
 use midshift_proto::convert::common::timestamp;
 use midshift_proto::identity::v1;
@@ -340,14 +340,14 @@ impl IdentityFace for IdentityService {
 #[tonic::async_trait]
 impl EnrolmentFace for IdentityService {
     async fn enrol(&self, request: Request<v1::EnrolRequest>) -> Result<Response<v1::EnrolResponse>, Status> {
-        let denying = Denying::from_request(&request);
-        answered(self.enrolled(request.into_inner()).await.inspect_err(|refusal| denying.report(refusal)))
+        let reporter = DenialReporter::from_request(&request);
+        answered(self.enrolled(request.into_inner()).await.inspect_err(|refusal| reporter.report(refusal)))
     }
     async fn renew_certificate(
         &self,
         request: Request<v1::RenewCertificateRequest>,
     ) -> Result<Response<v1::RenewCertificateResponse>, Status> {
-        let (caller, denying) = (caller(&request), Denying::from_request(&request));
-        answered(self.renewed(request.into_inner(), &caller).await.inspect_err(|refusal| denying.report(refusal)))
+        let (caller, reporter) = (caller(&request), DenialReporter::from_request(&request));
+        answered(self.renewed(request.into_inner(), &caller).await.inspect_err(|refusal| reporter.report(refusal)))
     }
 }

@@ -21,7 +21,7 @@ use midshift_core::time::Now;
 use midshift_proto::convert::stop::{CheckIn, ToStop};
 use midshift_proto::status::unreadable;
 use midshift_proto::stop::v1;
-use midshift_proto::{Denying, Leaving};
+use midshift_proto::{DenialReporter, Leaving};
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -33,12 +33,12 @@ pub async fn attend(
     inner: Arc<Inner>,
     by: &Caller,
     leaving: Leaving,
-    denying: &Denying,
+    reporter: &DenialReporter,
     mut up: Streaming<v1::AttendRequest>,
 ) -> Result<Response<Down>, Status> {
     let begun = begin(&inner, by, &mut up).await;
     let (robot, outbox) = begun
-        .inspect_err(|refusal| denying.report(refusal))
+        .inspect_err(|refusal| reporter.report(refusal))
         .map_err(|refusal| midshift_proto::status(&refusal, None))?;
     let down = Down::new(inner.clone(), outbox.clone());
     tokio::spawn(async move {

@@ -8,7 +8,7 @@ use crate::admit::{Admitted, Durable, Prepared, no_result};
 use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::reason::{Reason, Refusal};
-use midshift_proto::Denying;
+use midshift_proto::DenialReporter;
 use midshift_proto::common::v1::FieldViolation;
 use midshift_proto::convert::shown;
 use midshift_proto::task::v1::{self, submit_task_request::Body, submit_task_result::Outcome};
@@ -34,7 +34,7 @@ type Waiting = (v1::SubmitTasksRequest, OwnedSemaphorePermit);
 pub struct Batch<'a> {
     service: &'a TaskService,
     by: &'a Caller,
-    denying: Denying,
+    reporter: DenialReporter,
     slice: Vec<v1::SubmitTaskRequest>,
     /// Ids that items of the slice chose.
     chosen: BTreeSet<String>,
@@ -43,8 +43,8 @@ pub struct Batch<'a> {
 
 impl<'a> Batch<'a> {
     /// An empty one of this caller; what it may not is told there.
-    pub fn new(service: &'a TaskService, by: &'a Caller, denying: Denying) -> Self {
-        Self { service, by, denying, slice: Vec::new(), chosen: BTreeSet::new(), results: Vec::new() }
+    pub fn new(service: &'a TaskService, by: &'a Caller, reporter: DenialReporter) -> Self {
+        Self { service, by, reporter, slice: Vec::new(), chosen: BTreeSet::new(), results: Vec::new() }
     }
 
     /// Reads `stream` to its end and commits every item; one result an item.
@@ -120,7 +120,7 @@ impl<'a> Batch<'a> {
                     },
                 },
             };
-            let outcome = outcome.inspect_err(|refusal| self.denying.report(refusal));
+            let outcome = outcome.inspect_err(|refusal| self.reporter.report(refusal));
             let notes = match &outcome {
                 // The task is durable, whether or not the rows of its robot can be read now.
                 Ok(Durable::New(intake)) => self.service.notes(&intake.spec).await.unwrap_or_default(),

@@ -8,7 +8,7 @@ use midshift_core::limits;
 use midshift_core::reason::{Kind, Refusal};
 use midshift_core::rows::Table;
 use midshift_core::task::Attempt;
-use midshift_proto::Denying;
+use midshift_proto::DenialReporter;
 use midshift_proto::access::caller;
 use midshift_proto::task::v1::{self, task_service_server::TaskService as Face};
 use midshift_proto::watches::{self, Reader};
@@ -64,15 +64,15 @@ impl Face for TaskService {
 
     async fn submit_task(&self, r: Request<v1::SubmitTaskRequest>) -> Result<Response<v1::SubmitTaskResponse>, Status> {
         let id = CallId::of_request(&r, &r.get_ref().request_id);
-        let (by, denying) = (caller(&r), Denying::from_request(&r));
-        id.answer(self.submit(r.into_inner(), &by).await.inspect_err(|refusal| denying.report(refusal)))
+        let (by, reporter) = (caller(&r), DenialReporter::from_request(&r));
+        id.answer(self.submit(r.into_inner(), &by).await.inspect_err(|refusal| reporter.report(refusal)))
     }
     async fn submit_tasks(
         &self,
         r: Request<Streaming<v1::SubmitTasksRequest>>,
     ) -> Result<Response<v1::SubmitTasksResponse>, Status> {
-        let (id, by, denying) = (CallId::of_request(&r, ""), caller(&r), Denying::from_request(&r));
-        let results = Batch::new(self, &by, denying).run(r.into_inner()).await.map_err(|broken| match broken {
+        let (id, by, reporter) = (CallId::of_request(&r, ""), caller(&r), DenialReporter::from_request(&r));
+        let results = Batch::new(self, &by, reporter).run(r.into_inner()).await.map_err(|broken| match broken {
             Broken::Stream(status) => status,
             Broken::Refused(refusal) => id.status(&refusal),
         })?;

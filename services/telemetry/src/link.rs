@@ -12,7 +12,7 @@ use midshift_proto::access::caller;
 use midshift_proto::link::v1::{self, link_service_server::LinkService};
 use midshift_proto::session::{FromRobot, Hello, ToRobot};
 use midshift_proto::status::unreadable;
-use midshift_proto::{Denying, Leaving};
+use midshift_proto::{DenialReporter, Leaving};
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio::time::Instant;
@@ -35,8 +35,8 @@ impl LinkService for TelemetryService {
     ) -> Result<Response<Self::SessionStream>, Status> {
         let (down, stream) = mpsc::channel(DOWN_MAX);
         let service = self.clone();
-        let (by, leaving, denying) =
-            (caller(&request), Leaving::from_request(&request), Denying::from_request(&request));
+        let (by, leaving, reporter) =
+            (caller(&request), Leaving::from_request(&request), DenialReporter::from_request(&request));
         let up = request.into_inner();
         tokio::spawn(async move {
             let shutdown = service.inner.shutdown.clone();
@@ -44,7 +44,7 @@ impl LinkService for TelemetryService {
                 () = down.closed() => {}
                 result = service.hold(&by, leaving, up, down.clone()) => {
                     if let Err(refusal) = &result {
-                        denying.report(refusal);
+                        reporter.report(refusal);
                     }
                     if let Err(refusal) = result
                         && !shutdown.is_cancelled()

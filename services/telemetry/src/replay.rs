@@ -11,7 +11,7 @@ use midshift_proto::access::caller;
 use midshift_proto::link::v1::replay_service_server::ReplayService;
 use midshift_proto::link::v1::{ReplayStatusRequest, ReplayStatusResponse};
 use midshift_proto::session::{LaneAck, StatusReplay};
-use midshift_proto::{Denying, parse, status};
+use midshift_proto::{DenialReporter, parse, status};
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::oneshot;
 use tonic::{Request, Response, Status};
@@ -31,12 +31,12 @@ impl ReplayService for TelemetryService {
         &self,
         request: Request<ReplayStatusRequest>,
     ) -> Result<Response<ReplayStatusResponse>, Status> {
-        let (by, denying) = (caller(&request), Denying::from_request(&request));
+        let (by, reporter) = (caller(&request), DenialReporter::from_request(&request));
         let ack = match parse(request.into_inner()) {
             Ok(replay) => self.hand_over(&by, replay).await,
             Err(refusal) => Err(refusal),
         };
-        ack.inspect_err(|refusal| denying.report(refusal))
+        ack.inspect_err(|refusal| reporter.report(refusal))
             .map(|ack| Response::new((&ack).into()))
             .map_err(|refusal| status(&refusal, None))
     }

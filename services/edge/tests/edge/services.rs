@@ -7,7 +7,7 @@ use http_body_util::StreamBody;
 use midshift_core::identity::Caller;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_edge::Peer;
-use midshift_proto::Denying;
+use midshift_proto::DenialReporter;
 use std::convert::Infallible;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -47,7 +47,7 @@ async fn answer(request: Request<Body>, poked: Arc<Notify>) -> Response<Body> {
     let path = request.uri().path().to_owned();
     if request.headers().contains_key("deny") {
         let reason = Reason::from(Code::NotThisRobot).with("robot_id", "r8");
-        Denying::from_request(&tonic::Request::from_http(request)).report(&Refusal::new(Kind::Denied, reason));
+        DenialReporter::from_request(&tonic::Request::from_http(request)).report(&Refusal::new(Kind::Denied, reason));
         return ok(Vec::new());
     }
     if request.headers().contains_key("hold") {

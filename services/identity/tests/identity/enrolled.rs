@@ -6,7 +6,7 @@ use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_identity::IdentityService;
-use midshift_proto::Denying;
+use midshift_proto::DenialReporter;
 use midshift_proto::access::local;
 use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as _;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
@@ -103,14 +103,14 @@ async fn whoever_may_not_enrol_or_renew_is_told_of_with_the_robot_that_it_named(
         let (robot_id, secret) = (robot_id.to_owned(), crate::world::shown(&line));
         let request = midshift_proto::identity::v1::EnrolRequest { robot_id, secret, request_pem: machine.request() };
         let mut request = asked_by(Caller::nobody(), request);
-        request.extensions_mut().insert(Denying::new(told.clone()));
+        request.extensions_mut().insert(DenialReporter::new(told.clone()));
         identity.enrol(request).await.is_ok()
     };
     assert!(!enrol("r8", &machine).await && enrol("r7", &machine).await && !enrol("r7", &Machine::new()).await);
     let own = Caller::robot(RobotId::parse("r7").expect("an id"));
     let request = RenewCertificateRequest { robot_id: "r7".to_owned(), request_pem: Machine::new().request() };
     let mut request = asked_by(own, request);
-    request.extensions_mut().insert(Denying::new(told.clone()));
+    request.extensions_mut().insert(DenialReporter::new(told.clone()));
     assert!(identity.renew_certificate(request).await.is_err());
     let robot = |id: &str| Some(id.to_owned());
     let expected =

@@ -9,7 +9,7 @@ use midshift_core::time::{Clock, Utc};
 use midshift_core::wall_clock::WallClock;
 use midshift_identity::{Duty, Error, IdentityService, Parts};
 use midshift_proto::access::local;
-use midshift_proto::denying::Told;
+use midshift_proto::denials::DenialSink;
 use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as _;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
 use midshift_proto::identity::v1::{CreateEnrolmentRequest, EnrolRequest, EnrolResponse};
@@ -97,7 +97,7 @@ impl Machine {
 #[derive(Default)]
 pub struct Heard(pub Mutex<Vec<(Code, Option<String>)>>);
 
-impl Told for Heard {
+impl DenialSink for Heard {
     fn denied(&self, refusal: &Refusal) {
         let robot_id = refusal.reason.metadata.get("robot_id").cloned();
         self.0.lock().expect("not poisoned").push((refusal.reason.code, robot_id));

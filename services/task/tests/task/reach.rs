@@ -8,8 +8,8 @@ use midshift_core::reason::Refusal;
 use midshift_core::rows::{Item, Table, Writer};
 use midshift_core::site::PlaceKind;
 use midshift_core::task::{TaskIntake, TaskRequest};
-use midshift_proto::Denying;
-use midshift_proto::denying::Told;
+use midshift_proto::DenialReporter;
+use midshift_proto::denials::DenialSink;
 use midshift_proto::task::v1::submit_task_request::Body;
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_result::Outcome, watch_tasks_response};
@@ -28,7 +28,7 @@ impl Heard {
     }
 }
 
-impl Told for Heard {
+impl DenialSink for Heard {
     fn denied(&self, refusal: &Refusal) {
         self.0.lock().expect("not poisoned").push(refusal.reason.code.as_str().to_owned());
     }
@@ -90,7 +90,7 @@ async fn work_is_brought_in_where_the_caller_dispatches_and_under_its_name() {
     }
     let told = Arc::new(Heard::default());
     let mut request = asked(&anna, drive("other", "Q01", &[]));
-    request.extensions_mut().insert(Denying::new(told.clone()));
+    request.extensions_mut().insert(DenialReporter::new(told.clone()));
     world.service.submit_task(request).await.expect_err("not her area");
     assert_eq!(told.codes(), ["NOT_PERMITTED"], "for the audit");
     let nowhere = v1::step::Kind::Wait(v1::Wait { duration: Some(prost_types::Duration { seconds: 1, nanos: 0 }) });
