@@ -8,8 +8,8 @@ pub mod chunk;
 pub mod convert;
 pub mod denials;
 mod generated;
+pub mod go_away;
 pub mod json;
-pub mod leaving;
 pub mod pages;
 pub mod session;
 pub mod status;
@@ -23,7 +23,7 @@ mod secrets {
 pub use convert::{Parse, parse, parse_field, parse_word};
 pub use denials::DenialReporter;
 pub use generated::{common, fleet, identity, link, ota, sim, stop, task, telemetry};
-pub use leaving::Leaving;
+pub use go_away::GoAwayNotice;
 pub use status::{refusal_of, status};
 
 /// Descriptors of all packages with their comments, for reflection and JSON.

@@ -118,7 +118,7 @@ pub struct Age {
     pub after: LinkDuration,
     /// So much younger or older, permille of it: connections that came together do not go together. At most 1000.
     pub jitter_permille: u32,
-    /// From telling its streams ([`crate::Peer::leaving`]) to GOAWAY.
+    /// From telling its streams ([`crate::Peer::go_away`]) to GOAWAY.
     pub notice: LinkDuration,
     /// From GOAWAY to the close.
     pub grace: LinkDuration,

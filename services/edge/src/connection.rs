@@ -203,7 +203,7 @@ impl Port {
             // Whoever stopped the port counts the time for all.
             Reason::Stop => (End::Stopped, None),
         };
-        peer.leaving.begin();
+        peer.go_away.begin();
         served.as_mut().graceful_shutdown();
         let time_over = async {
             match time {
@@ -260,7 +260,7 @@ impl Port {
     async fn grows_old(&self, peer: &Peer) {
         let Some(age) = self.config.age else { return std::future::pending().await };
         sleep(age.drawn(rand::random())).await;
-        peer.leaving.begin();
+        peer.go_away.begin();
         sleep(std(age.notice)).await;
     }
 

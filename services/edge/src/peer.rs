@@ -6,7 +6,7 @@
 use http::HeaderMap;
 use midshift_core::identity::{Caller, TokenId};
 use midshift_core::reason::Refusal;
-use midshift_proto::Leaving;
+use midshift_proto::GoAwayNotice;
 use rustls::pki_types::CertificateDer;
 use std::collections::BTreeMap;
 use std::fmt;
@@ -34,7 +34,7 @@ pub struct Peer {
     pub certificate: Option<Arc<CertificateDer<'static>>>,
     /// Which connection.
     pub connection: ConnectionId,
-    pub(crate) leaving: Leaving,
+    pub(crate) go_away: GoAwayNotice,
     /// Its streams end now.
     pub(crate) over: CancellationToken,
     /// Whose requests it carried, open streams among them, and whether their time was over then, so that they may only stop.
@@ -47,8 +47,8 @@ impl Peer {
         certificate: Option<CertificateDer<'static>>,
         connection: ConnectionId,
     ) -> Self {
-        let (leaving, over) = (Leaving::default(), CancellationToken::new());
-        Self { address, certificate: certificate.map(Arc::new), connection, leaving, over, tokens: Arc::default() }
+        let (go_away, over) = (GoAwayNotice::default(), CancellationToken::new());
+        Self { address, certificate: certificate.map(Arc::new), connection, go_away, over, tokens: Arc::default() }
     }
 
     /// Remembers that it showed this token, and whether that only stops any more; whether it is the first time.
@@ -69,8 +69,8 @@ impl Peer {
 
     /// Resolves when the connection is about to be asked to go, for its age or because the port closes. Whoever holds a stream on it uses the
     /// time to send its peer elsewhere. Never resolves for a connection that is cut.
-    pub async fn leaving(&self) {
-        self.leaving.begun().await;
+    pub async fn go_away(&self) {
+        self.go_away.begun().await;
     }
 }
 

@@ -263,7 +263,7 @@ impl HyperService<Request<Incoming>> for Door {
             }
         };
         request.extensions_mut().insert(self.peer.clone());
-        request.extensions_mut().insert(self.peer.leaving.clone());
+        request.extensions_mut().insert(self.peer.go_away.clone());
         let reporter = self.denial_reporter(&caller, request.uri());
         request.extensions_mut().insert(reporter);
         request.extensions_mut().insert(caller);

@@ -21,7 +21,7 @@ use midshift_core::time::Now;
 use midshift_proto::convert::stop::{CheckIn, ToStop};
 use midshift_proto::status::unreadable;
 use midshift_proto::stop::v1;
-use midshift_proto::{DenialReporter, Leaving};
+use midshift_proto::{DenialReporter, GoAwayNotice};
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -32,7 +32,7 @@ use tracing::field::Empty;
 pub async fn attend(
     inner: Arc<Inner>,
     by: &Caller,
-    leaving: Leaving,
+    go_away: GoAwayNotice,
     reporter: &DenialReporter,
     mut up: Streaming<v1::AttendRequest>,
 ) -> Result<Response<Down>, Status> {
@@ -42,7 +42,7 @@ pub async fn attend(
         .map_err(|refusal| midshift_proto::status(&refusal, None))?;
     let down = Down::new(inner.clone(), outbox.clone());
     tokio::spawn(async move {
-        hold(&inner, &robot, &outbox, &leaving, up).await;
+        hold(&inner, &robot, &outbox, &go_away, up).await;
         Robots::detach(&robot, &outbox);
         metrics::gauge!("midshift_stop_lines").decrement(1);
         tracing::info!(peer = Empty, robot_id = %robot.robot_id, "stop line ended");
@@ -118,11 +118,11 @@ async fn hold(
     inner: &Arc<Inner>,
     robot: &Robot,
     outbox: &Arc<Outbox>,
-    leaving: &Leaving,
+    go_away: &GoAwayNotice,
     mut up: Streaming<v1::AttendRequest>,
 ) {
     // An old connection: the robot has its next line before it leaves this one.
-    let mut moves = pin!(leaving.begun());
+    let mut moves = pin!(go_away.begun());
     let mut is_moving = false;
     let silent = Duration::from_millis(limits::STOP_LINE_SILENT.as_ms());
     loop {

@@ -9,7 +9,7 @@ use bytes::{BufMut, Bytes};
 use midshift_core::limits;
 use midshift_proto::access::caller;
 use midshift_proto::stop::v1;
-use midshift_proto::{DenialReporter, Leaving};
+use midshift_proto::{DenialReporter, GoAwayNotice};
 use std::convert::Infallible;
 use std::sync::Arc;
 use std::task::{Context, Poll};
@@ -65,9 +65,9 @@ impl StreamingService<v1::AttendRequest> for Attend {
     type Future = BoxFuture<Response<Down>, Status>;
 
     fn call(&mut self, request: Request<Streaming<v1::AttendRequest>>) -> Self::Future {
-        let (inner, by, leaving) = (self.0.clone(), caller(&request), Leaving::from_request(&request));
+        let (inner, by, go_away) = (self.0.clone(), caller(&request), GoAwayNotice::from_request(&request));
         let reporter = DenialReporter::from_request(&request);
-        Box::pin(async move { line::attend(inner, &by, leaving, &reporter, request.into_inner()).await })
+        Box::pin(async move { line::attend(inner, &by, go_away, &reporter, request.into_inner()).await })
     }
 }
 

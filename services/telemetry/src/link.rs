@@ -12,7 +12,7 @@ use midshift_proto::access::caller;
 use midshift_proto::link::v1::{self, link_service_server::LinkService};
 use midshift_proto::session::{FromRobot, Hello, ToRobot};
 use midshift_proto::status::unreadable;
-use midshift_proto::{DenialReporter, Leaving};
+use midshift_proto::{DenialReporter, GoAwayNotice};
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio::time::Instant;
@@ -35,14 +35,14 @@ impl LinkService for TelemetryService {
     ) -> Result<Response<Self::SessionStream>, Status> {
         let (down, stream) = mpsc::channel(DOWN_MAX);
         let service = self.clone();
-        let (by, leaving, reporter) =
-            (caller(&request), Leaving::from_request(&request), DenialReporter::from_request(&request));
+        let (by, go_away, reporter) =
+            (caller(&request), GoAwayNotice::from_request(&request), DenialReporter::from_request(&request));
         let up = request.into_inner();
         tokio::spawn(async move {
             let shutdown = service.inner.shutdown.clone();
             tokio::select! {
                 () = down.closed() => {}
-                result = service.hold(&by, leaving, up, down.clone()) => {
+                result = service.hold(&by, go_away, up, down.clone()) => {
                     if let Err(refusal) = &result {
                         reporter.report(refusal);
                     }
@@ -62,7 +62,7 @@ impl TelemetryService {
     async fn hold(
         &self,
         by: &Caller,
-        leaving: Leaving,
+        go_away: GoAwayNotice,
         mut up: Streaming<v1::SessionRequest>,
         down: Down,
     ) -> Result<(), Refusal> {
@@ -102,7 +102,7 @@ impl TelemetryService {
         if down.send(Ok((&message).into())).await.is_err() {
             return Ok(());
         }
-        session::run(self.inner.clone(), &hello, begun, leaving, up, down).await;
+        session::run(self.inner.clone(), &hello, begun, go_away, up, down).await;
         tracing::info!(peer = Empty, %robot_id, session_epoch = epoch, "session ended");
         Ok(())
     }

@@ -25,7 +25,7 @@ use midshift_core::robot::Lane;
 use midshift_core::rows::{Fact, Item, Log, Writer};
 use midshift_core::time::{LinkDuration, SiteTime};
 use midshift_core::work::{InboxEntry, InboxItem, Live};
-use midshift_proto::Leaving;
+use midshift_proto::GoAwayNotice;
 use midshift_proto::link::v1;
 use midshift_proto::session::{
     ClockSample, Close, CloseCode, Downlink, Echo, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, ToRobot, Uplink,
@@ -110,7 +110,7 @@ pub async fn run(
     inner: Arc<Inner>,
     hello: &Hello,
     begun: Begun,
-    leaving: Leaving,
+    go_away: GoAwayNotice,
     mut up: Streaming<v1::SessionRequest>,
     down: Down,
 ) {
@@ -146,7 +146,7 @@ pub async fn run(
         robot_id: robot_id.clone(),
         inner: inner.clone(),
     };
-    let end = session.run(&leaving, &mut up, &down, &mut desired).await;
+    let end = session.run(&go_away, &mut up, &down, &mut desired).await;
     if let End::Close(close) = end {
         // Of a session that is only observed nobody knows whether it is the robot.
         if close.code == CloseCode::Protocol && session.in_charge.is_some() {
@@ -159,7 +159,7 @@ pub async fn run(
 impl Session {
     async fn run(
         &mut self,
-        leaving: &Leaving,
+        go_away: &GoAwayNotice,
         up: &mut Streaming<v1::SessionRequest>,
         down: &Down,
         desired: &mut tokio::sync::watch::Receiver<Sections>,
@@ -170,7 +170,7 @@ impl Session {
         let moves = async {
             tokio::select! {
                 () = ends.cancelled() => {}
-                () = leaving.begun() => {}
+                () = go_away.begun() => {}
             }
         };
         tokio::pin!(moves);

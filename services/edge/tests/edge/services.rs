@@ -18,7 +18,7 @@ use tonic::body::Body;
 use tower::Service;
 
 /// Answers by path: `/who` tells who asked, `/hang` never answers, `/stream` answers and goes on without a word, `/pulse` says a word for each
-/// `/poke`, `/leaving` ends when its connection is about to be asked to go. Any path with a header `hold` is as `/stream`; with `deny`
+/// `/poke`, `/go_away` ends when its connection is about to be asked to go. Any path with a header `hold` is as `/stream`; with `deny`
 /// it says that it denies what the port let in.
 #[derive(Clone, Default)]
 pub struct Services {
@@ -77,7 +77,7 @@ async fn answer(request: Request<Body>, poked: Arc<Notify>) -> Response<Body> {
         "/leaving" => {
             let (sender, said) = mpsc::channel(1);
             tokio::spawn(async move {
-                peer.leaving().await;
+                peer.go_away().await;
                 let _ = sender.send(Ok::<_, Infallible>(Frame::trailers(status_ok()))).await;
             });
             grpc(Body::new(StreamBody::new(ReceiverStream::new(said))))

@@ -8,7 +8,7 @@ use midshift_core::site::Site;
 use midshift_core::stop::ladder::{Around, Stage};
 use midshift_core::stop::{Latch, Stop};
 use midshift_core::time::{Clock, ScaledClock, Utc};
-use midshift_proto::Leaving;
+use midshift_proto::GoAwayNotice;
 use midshift_proto::convert::stop::{CheckIn, FromStop, ToStop};
 use midshift_proto::stop::v1;
 use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
@@ -76,7 +76,7 @@ pub struct Server {
     pub service: StopService,
     ahead_us: Arc<AtomicU64>,
     /// What requests that come now are told of their connection.
-    leaving: Arc<Mutex<Leaving>>,
+    go_away: Arc<Mutex<GoAwayNotice>>,
 }
 
 impl Server {
@@ -107,8 +107,8 @@ impl Server {
             })
             .await
             .unwrap();
-        let leaving = Arc::new(Mutex::new(Leaving::default()));
-        let told = leaving.clone();
+        let go_away = Arc::new(Mutex::new(GoAwayNotice::default()));
+        let told = go_away.clone();
         let asked = move |mut request: Request<()>| {
             request.extensions_mut().insert(told.lock().unwrap().clone());
             known(request)
@@ -134,12 +134,12 @@ impl Server {
             };
             serve(service, port).await.map(|served| served.unwrap())
         });
-        Self { runtime: Some(runtime), serving, shutdown, address, service, ahead_us, leaving }
+        Self { runtime: Some(runtime), serving, shutdown, address, service, ahead_us, go_away }
     }
 
     /// All connections that there are now are old.
     pub fn age(&self) {
-        std::mem::take(&mut *self.leaving.lock().unwrap()).begin();
+        std::mem::take(&mut *self.go_away.lock().unwrap()).begin();
     }
 
     /// The link clock and the wall of this server go ahead.

@@ -5,7 +5,7 @@ use midshift_core::ids::{RobotId, SiteId, WaypointId};
 use midshift_core::robot::{Lane, Mode, ReportedState, Vitals};
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_core::work::{InboxItem, Live, RobotEvent, Sample, SampleBody};
-use midshift_proto::Leaving;
+use midshift_proto::GoAwayNotice;
 use midshift_proto::link::v1::link_service_client::LinkServiceClient;
 use midshift_proto::link::v1::{SessionRequest, SessionResponse};
 use midshift_proto::session::{
@@ -30,18 +30,18 @@ pub struct World {
     pub board: Arc<LiveBoard<Live>>,
     /// Ends the service.
     pub end: CancellationToken,
-    leaving: Leavings,
+    go_away: GoAwayNotices,
     pipes: Pipes,
 }
 
 /// What requests that come now are told of their connection.
-type Leavings = Arc<Mutex<Leaving>>;
+type GoAwayNotices = Arc<Mutex<GoAwayNotice>>;
 type Pipes = mpsc::Sender<std::io::Result<tokio::io::DuplexStream>>;
 
 impl World {
     /// All connections that there are now are old.
     pub fn age(&self) {
-        std::mem::take(&mut *self.leaving.lock().expect("not poisoned")).begin();
+        std::mem::take(&mut *self.go_away.lock().expect("not poisoned")).begin();
     }
     /// Another connection.
     pub async fn dial(&self) -> Result<Channel> {
@@ -112,8 +112,8 @@ pub async fn serve_after(parts: Parts, read: impl Future<Output = ()> + Send + '
         running.run().await
     });
     let (pipes, incoming) = mpsc::channel::<std::io::Result<tokio::io::DuplexStream>>(8);
-    let leaving = Leavings::default();
-    let told = leaving.clone();
+    let go_away = GoAwayNotices::default();
+    let told = go_away.clone();
     let layer = InterceptorLayer::new(move |mut request: Request<()>| {
         request.extensions_mut().insert(told.lock().expect("not poisoned").clone());
         known(request)
@@ -121,7 +121,7 @@ pub async fn serve_after(parts: Parts, read: impl Future<Output = ()> + Send + '
     let server = Server::builder().layer(layer).add_routes(service.add_to(Routes::default()));
     tokio::spawn(server.serve_with_incoming(ReceiverStream::new(incoming)));
     let channel = dial(pipes.clone()).await?;
-    Ok(World { store, channel, service, board, end, leaving, pipes })
+    Ok(World { store, channel, service, board, end, go_away, pipes })
 }
 
 /// Header in which a test says who asks; without it everybody may do everything, as at a port without login.
