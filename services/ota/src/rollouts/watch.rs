@@ -41,14 +41,14 @@ pub enum Countdowns {
 /// What may change of a robot: its row, the tasks that it ended on trial, and how much it has downloaded, permille.
 type Shown = (Revision, TaskTally, u32);
 
-/// What a watcher was told last, and what it is told next.
-struct Told {
+/// Remembers what a watcher was sent last, and composes what it is sent next.
+struct RolloutWatcher {
     countdowns: Countdowns,
     rollout: Option<v1::Rollout>,
     robots: BTreeMap<String, Shown>,
 }
 
-impl Told {
+impl RolloutWatcher {
     /// What is new; none: nothing is, or the roll-out is gone. Says also whether it has ended.
     fn next(
         &mut self,
@@ -86,16 +86,16 @@ impl Told {
 
     /// Whether a watcher knows this already. Time that passes is news only to one that follows it.
     fn has_told(&self, rollout: &v1::Rollout) -> bool {
-        let Some(told) = &self.rollout else { return false };
+        let Some(sent) = &self.rollout else { return false };
         if self.countdowns == Countdowns::Followed {
-            return told == rollout;
+            return sent == rollout;
         }
         let begun = |rollout: &v1::Rollout| (rollout.soak_left.is_some(), rollout.exposure_left.is_some());
-        let (soak_left, exposure_left) = (told.soak_left, told.exposure_left);
+        let (soak_left, exposure_left) = (sent.soak_left, sent.exposure_left);
         // Tasks are told with the robots that ended them.
-        let (trial, control) = (told.trial, told.control);
+        let (trial, control) = (sent.trial, sent.control);
         let same = v1::Rollout { soak_left, exposure_left, trial, control, ..rollout.clone() };
-        begun(told) == begun(rollout) && *told == same
+        begun(sent) == begun(rollout) && *sent == same
     }
 }
 
@@ -107,15 +107,15 @@ pub async fn watch(
     by: Caller,
     teller: &Teller<v1::WatchRolloutResponse>,
 ) {
-    let mut told = Told { countdowns, rollout: None, robots: BTreeMap::new() };
+    let mut watcher = RolloutWatcher { countdowns, rollout: None, robots: BTreeMap::new() };
     let mut changed = service.changed.clone();
     while teller.asked().await.is_ok() {
         changed.mark_unchanged();
         let (asked, by) = (id.clone(), by.clone());
         let looked = service
             .ask_about(vec![id.clone()], move |view, board, now| {
-                let next = told.next(view, board, now, &asked, &by);
-                (told, next)
+                let next = watcher.next(view, board, now, &asked, &by);
+                (watcher, next)
             })
             .await;
         let next = looked.and_then(|(after, next)| next.map(|next| (after, next)));
@@ -126,7 +126,7 @@ pub async fn watch(
                 return;
             }
         };
-        told = after;
+        watcher = after;
         if let Some(message) = message {
             teller.tell_message(message);
         }

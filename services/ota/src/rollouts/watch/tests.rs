@@ -1,6 +1,6 @@
 //! What a watcher is told of a roll-out on whose trial tasks end.
 
-use super::{Countdowns, Told};
+use super::{Countdowns, RolloutWatcher};
 use midshift_core::fleet::rows::RobotCounter;
 use midshift_core::gates::{FailureEvidence, TaskTally};
 use midshift_core::identity::Caller;
@@ -143,14 +143,14 @@ impl Rig {
     fn pass(&mut self, secs: u64) {
         self.now.site = SiteTime(self.now.site.0 + secs * 1_000);
     }
-    fn next(&self, told: &mut Told) -> Option<v1::WatchRolloutResponse> {
+    fn next(&self, told: &mut RolloutWatcher) -> Option<v1::WatchRolloutResponse> {
         let next = told.next(&self.view, &Board::new(), &self.now, &id(), &Caller::local());
         next.expect("it is there").0
     }
 }
 
-fn watcher(countdowns: Countdowns) -> Told {
-    Told { countdowns, rollout: None, robots: BTreeMap::new() }
+fn watcher(countdowns: Countdowns) -> RolloutWatcher {
+    RolloutWatcher { countdowns, rollout: None, robots: BTreeMap::new() }
 }
 
 #[test]
