@@ -1,4 +1,4 @@
-//! Logs what fails again and again: at once the first time, and with a count once a minute after that.
+//! Limits how often a repeated failure is logged: at once the first time, and once a minute with a count after that.
 //!
 //! Invariant: a reason is never lost, and however fast it comes it is logged at most once a minute. Called by the
 //! session and the stop line.
@@ -11,8 +11,8 @@ const EVERY: Duration = Duration::from_secs(60);
 /// Reasons that are told apart; of more the oldest is forgotten, and logged anew.
 const REASONS_MAX: usize = 8;
 
-/// One reason.
-struct Told {
+/// One reason that was logged.
+struct LoggedReason {
     why: String,
     at: Instant,
     /// How often it came since it was logged.
@@ -21,18 +21,18 @@ struct Told {
 
 /// Reasons that were logged since something worked.
 #[derive(Default)]
-pub(crate) struct Repeats(Vec<Told>);
+pub(crate) struct Repeats(Vec<LoggedReason>);
 
 impl Repeats {
     /// How often `why` came since it was logged last, this time included, if it is to be logged now; none: it is only
     /// counted.
     pub(crate) fn count(&mut self, why: &str) -> Option<u32> {
         let now = Instant::now();
-        let Some(known) = self.0.iter_mut().find(|told| told.why == why) else {
+        let Some(known) = self.0.iter_mut().find(|logged| logged.why == why) else {
             if self.0.len() >= REASONS_MAX {
                 self.0.remove(0);
             }
-            self.0.push(Told { why: why.to_owned(), at: now, times: 0 });
+            self.0.push(LoggedReason { why: why.to_owned(), at: now, times: 0 });
             return Some(1);
         };
         known.times += 1;
