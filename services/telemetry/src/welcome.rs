@@ -99,14 +99,14 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
         let measured = live.and_then(|live| live.clock).map(|clock| clock.clock_offset_ms);
         let clock_offset_ms = measured.or(row.as_ref().and_then(|(row, _)| row.clock_offset_ms));
         let known = row.as_ref().and_then(|(row, _)| known_device_key(row, robot.as_ref()));
-        let mut said = judge(hello, known);
-        if let Some(key) = &said.other_key
+        let mut claim = judge(hello, known);
+        if let Some(key) = &claim.other_key
             && accepts(inner, &hello.robot_id, key).await.map_err(unavailable)?
         {
-            said = judge(hello, None);
+            claim = judge(hello, None);
         }
         let enrolled_unix_ms = robot.as_ref().and_then(|robot| robot.enrolled_unix_ms);
-        let session = Session { clock_offset_ms, enrolled_unix_ms, ..session_row(hello, session_epoch, &said) };
+        let session = Session { clock_offset_ms, enrolled_unix_ms, ..session_row(hello, session_epoch, &claim) };
         let mut item = Item::new(Writer::Telemetry, hello.robot_id.as_str());
         item.put_row(&session, row.map_or(Expect::Absent, |(_, revision)| Expect::At(revision)), "session.begun");
         match store.commit(vec![item]).await.pop() {
@@ -115,13 +115,13 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
             Some(Err(error)) => return Err(unavailable(error)),
             None => return Err(unavailable("the store gave no answer")),
         }
-        told(hello, &said);
+        log_disbelief(hello, &claim);
         let (in_charge, replays) = InCharge::new(session_epoch, session.secret.clone(), now.link);
         if !inner.registry.take_charge(&hello.robot_id, in_charge.clone()) {
             continue;
         }
         let welcome = welcome(inner, session_epoch, session.secret, &mark.0, status, false);
-        let waits = said.other_key.map(|key| Waits::DeviceKey(hello.robot_id.clone(), key));
+        let waits = claim.other_key.map(|key| Waits::DeviceKey(hello.robot_id.clone(), key));
         return Ok(Begun { part: Some((in_charge, replays)), waits, welcome, mark, status });
     }
     Err(Refusal::new(Kind::Conflict, Code::CloneSeen))
@@ -147,9 +147,9 @@ fn draw_secret() -> SessionSecret {
     format!("{:032x}", rand::random::<u128>()).into()
 }
 
-/// What a Hello says of the robot's software, held against the key that its machine is known by.
+/// What a Hello claims of the robot's software, checked against the key that its machine is known by.
 #[derive(Default)]
-struct Said {
+struct SoftwareClaim {
     installed: Option<Installed>,
     device_key: Option<String>,
     /// Another key signed it.
@@ -159,39 +159,39 @@ struct Said {
 }
 
 /// Believes what the known key signed, and the first key that is ever seen. The session goes on in any case: work is no matter of this key.
-fn judge(hello: &Hello, known: Option<String>) -> Said {
+fn judge(hello: &Hello, known: Option<String>) -> SoftwareClaim {
     if hello.installed.is_empty() {
-        return Said { device_key: known, ..Said::default() };
+        return SoftwareClaim { device_key: known, ..SoftwareClaim::default() };
     }
     match installed::open(&hello.installed, &hello.robot_id, &hello.boot_id) {
-        Err(rejection) => Said { device_key: known, rejection: Some(rejection), ..Said::default() },
+        Err(rejection) => SoftwareClaim { device_key: known, rejection: Some(rejection), ..SoftwareClaim::default() },
         Ok(installed) => {
             let key = installed.device_key.clone();
             match known {
                 Some(known) if known != key => {
-                    Said { device_key: Some(known), other_key: Some(key), ..Said::default() }
+                    SoftwareClaim { device_key: Some(known), other_key: Some(key), ..SoftwareClaim::default() }
                 }
-                _ => Said { device_key: Some(key), installed: Some(installed), ..Said::default() },
+                _ => SoftwareClaim { device_key: Some(key), installed: Some(installed), ..SoftwareClaim::default() },
             }
         }
     }
 }
 
-/// What was not believed, for people.
-fn told(hello: &Hello, said: &Said) {
+/// Logs which of a robot's claims are not believed.
+fn log_disbelief(hello: &Hello, claim: &SoftwareClaim) {
     let robot_id = &hello.robot_id;
-    if let Some(other_key) = &said.other_key {
+    if let Some(other_key) = &claim.other_key {
         metrics::counter!("midshift_telemetry_device_keys_changed_total").increment(1);
-        let device_key = said.device_key.as_deref().unwrap_or_default();
+        let device_key = claim.device_key.as_deref().unwrap_or_default();
         tracing::warn!(peer = Empty, %robot_id, device_key, other_key, "another machine's key signed what this robot says it has installed: not believed");
     }
-    if let Some(rejection) = &said.rejection {
+    if let Some(rejection) = &claim.rejection {
         metrics::counter!("midshift_telemetry_installed_rejected_total").increment(1);
         tracing::warn!(peer = Empty, %robot_id, %rejection, "what this robot says it has installed is not believed");
     }
 }
 
-fn session_row(hello: &Hello, session_epoch: u64, said: &Said) -> Session {
+fn session_row(hello: &Hello, session_epoch: u64, claim: &SoftwareClaim) -> Session {
     Session {
         robot_id: hello.robot_id.clone(),
         session_epoch,
@@ -203,10 +203,10 @@ fn session_row(hello: &Hello, session_epoch: u64, said: &Said) -> Session {
         applied_update: hello.reported.applied_update,
         places: hello.reported.places.clone(),
         clock_offset_ms: None,
-        installed: said.installed.clone(),
-        device_key: said.device_key.clone(),
-        device_key_changed: said.other_key.is_some(),
-        other_device_key: said.other_key.clone(),
+        installed: claim.installed.clone(),
+        device_key: claim.device_key.clone(),
+        device_key_changed: claim.other_key.is_some(),
+        other_device_key: claim.other_key.clone(),
         enrolled_unix_ms: None,
     }
 }
