@@ -111,22 +111,22 @@ impl<S: Subscriber> Layer<S> for Throttle {
         if metadata.fields().field("peer").is_none() {
             return true;
         }
-        let mut said = Said::default();
-        event.record(&mut said);
-        let peer = said.peer.or(said.robot_id).unwrap_or_default();
-        self.0.is_written((*metadata.level(), said.message), peer)
+        let mut fields = LineFields::default();
+        event.record(&mut fields);
+        let peer = fields.peer.or(fields.robot_id).unwrap_or_default();
+        self.0.is_written((*metadata.level(), fields.message), peer)
     }
 }
 
-/// What a line says that tells it from others.
+/// The fields of a line that tell it from others.
 #[derive(Default)]
-struct Said {
+struct LineFields {
     message: String,
     peer: Option<String>,
     robot_id: Option<String>,
 }
 
-impl Said {
+impl LineFields {
     fn add_field(&mut self, field: &Field, value: fmt::Arguments<'_>) {
         match field.name() {
             "message" => self.message = value.to_string(),
@@ -137,7 +137,7 @@ impl Said {
     }
 }
 
-impl Visit for Said {
+impl Visit for LineFields {
     fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
         self.add_field(field, format_args!("{value:?}"));
     }
