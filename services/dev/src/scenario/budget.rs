@@ -15,9 +15,9 @@ use std::collections::{BTreeMap, BTreeSet};
 /// A planner may have seen a robot where it was so long ago.
 const LATELY: LinkDuration = LinkDuration::from_secs(5);
 
-/// What robots say that matters here.
+/// What one robot reports that matters for the budget of its area.
 #[derive(Clone, Debug)]
-pub struct Said {
+pub struct RobotReport {
     /// The robot that says it.
     pub robot_id: RobotId,
     /// When it was heard last.
@@ -111,34 +111,35 @@ impl Judge {
     }
 
     /// What robots say now. To be told before each drain, so that no planner saw more.
-    pub fn note_reports(&mut self, now: LinkTime, said: &[Said]) {
+    pub fn note_reports(&mut self, now: LinkTime, reports: &[RobotReport]) {
         self.now = now;
-        for said in said {
-            let known = Robot { heard: said.heard, areas: BTreeMap::new(), stuck: None };
-            let robot = self.robots.entry(said.robot_id.clone()).or_insert(known);
-            robot.heard = said.heard;
-            if let Some(area_id) = &said.area_id {
+        for report in reports {
+            let known = Robot { heard: report.heard, areas: BTreeMap::new(), stuck: None };
+            let robot = self.robots.entry(report.robot_id.clone()).or_insert(known);
+            robot.heard = report.heard;
+            if let Some(area_id) = &report.area_id {
                 robot.areas.insert(area_id.clone(), now);
             }
-            if said.is_stuck {
+            if report.is_stuck {
                 robot.stuck = Some(now);
             }
         }
     }
 
     /// What robots say now; all rows up to this moment were taken before.
-    pub fn judge_reports(&mut self, now: LinkTime, said: &[Said]) {
-        self.note_reports(now, said);
+    pub fn judge_reports(&mut self, now: LinkTime, reports: &[RobotReport]) {
+        self.note_reports(now, reports);
         self.knows_all = true;
         let is_out = |robot_id: &RobotId| self.on.values().any(|d| d.robot_id == *robot_id);
         let mut suspects = BTreeMap::new();
-        for said in said.iter().filter(|s| s.changes && !is_out(&s.robot_id)) {
-            let last = self.suspects.get(&said.robot_id).copied().unwrap_or(said.heard);
+        for report in reports.iter().filter(|s| s.changes && !is_out(&s.robot_id)) {
+            let last = self.suspects.get(&report.robot_id).copied().unwrap_or(report.heard);
             // One heartbeat proves nothing: an event ends a drain before the next heartbeat says the same.
-            if said.heard > last {
-                self.broken.push(format!("{} changed its software while no drain kept it out of work", said.robot_id));
+            if report.heard > last {
+                self.broken
+                    .push(format!("{} changed its software while no drain kept it out of work", report.robot_id));
             }
-            suspects.insert(said.robot_id.clone(), said.heard);
+            suspects.insert(report.robot_id.clone(), report.heard);
         }
         self.suspects = suspects;
         for area_id in self.permille.keys() {

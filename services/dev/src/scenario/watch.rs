@@ -3,7 +3,7 @@
 //! Invariant: what robots say is taken before the rows that follow from it are judged; rows that could not be read are an objection.
 //! Called by the story, once, and asked for each of its roll-outs.
 
-use super::budget::{Judge, Pace, Said, Seen};
+use super::budget::{Judge, Pace, RobotReport, Seen};
 use midshift_core::fleet::rows::Drain;
 use midshift_core::ids::{AreaId, RobotId};
 use midshift_core::rollout::rows::{Rollout, RolloutRobot};
@@ -77,9 +77,9 @@ impl Watcher {
                     if let Err(error) = read {
                         return picture.judge.cannot(format!("rows could not be read: {error}"));
                     }
-                    let said = sight.said();
-                    picture.judge.judge_reports(sight.clock.now().link, &said);
-                    picture.most = picture.most.max(said.iter().filter(|s| s.changes || s.goes_back).count());
+                    let reports = sight.reports();
+                    picture.judge.judge_reports(sight.clock.now().link, &reports);
+                    picture.most = picture.most.max(reports.iter().filter(|s| s.changes || s.goes_back).count());
                     picture.seq = rows.seq();
                 }
                 // A store that is gone ends with the story.
@@ -108,11 +108,11 @@ impl Watcher {
 }
 
 impl Sight {
-    fn said(&self) -> Vec<Said> {
-        let said = |(robot_id, live): (RobotId, Arc<Live>)| {
+    fn reports(&self) -> Vec<RobotReport> {
+        let report = |(robot_id, live): (RobotId, Arc<Live>)| {
             let at = live.report.vitals.waypoint.as_ref().and_then(|w| self.site.find(w));
             let state = live.report.update.as_ref().map(|u| u.state);
-            Said {
+            RobotReport {
                 robot_id,
                 heard: live.processed_at,
                 area_id: at.map(|at| self.site.area_of(at).area_id.clone()),
@@ -121,7 +121,7 @@ impl Sight {
                 goes_back: state == Some(UpdateState::RollingBack),
             }
         };
-        self.board.all().into_iter().map(said).collect()
+        self.board.all().into_iter().map(report).collect()
     }
 }
 
@@ -143,7 +143,7 @@ impl Fold for Rows {
         match change.key.table {
             Table::Drain => match change.decode::<Drain>()? {
                 Some(drain) => {
-                    judge.note_reports(self.sight.clock.now().link, &self.sight.said());
+                    judge.note_reports(self.sight.clock.now().link, &self.sight.reports());
                     judge.drain(drain);
                 }
                 None => judge.drain_is_gone(&change.key.id),

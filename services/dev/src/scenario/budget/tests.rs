@@ -1,6 +1,6 @@
 //! Each way in which robots can be out of work against the rules is one objection, and what the rules allow is none.
 
-use super::{Judge, Pace, Said};
+use super::{Judge, Pace, RobotReport};
 use midshift_core::fleet::rows::{Drain, DrainState};
 use midshift_core::ids::{AreaId, DrainId, RobotId, RolloutId};
 use midshift_core::time::{LinkTime, Utc};
@@ -20,8 +20,8 @@ fn rollout() -> RolloutId {
     RolloutId::parse("walk-2").expect("a roll-out")
 }
 
-fn said(number: usize, at: &str) -> Said {
-    Said {
+fn report(number: usize, at: &str) -> RobotReport {
+    RobotReport {
         robot_id: robot(number),
         heard: NOW,
         area_id: Some(area(at)),
@@ -58,8 +58,8 @@ fn judge() -> Judge {
     judge
 }
 
-fn all() -> Vec<Said> {
-    (0..20).map(|n| said(n, "hall")).chain((20..23).map(|n| said(n, "packing"))).collect()
+fn all() -> Vec<RobotReport> {
+    (0..20).map(|n| report(n, "hall")).chain((20..23).map(|n| report(n, "packing"))).collect()
 }
 
 #[test]
@@ -109,7 +109,7 @@ fn a_robot_counts_for_the_area_that_it_was_taken_from_until_its_drain_is_no_more
     judge.drain(drain(20, "packing"));
     judge.drain(Drain { state: DrainState::Held, ..drain(20, "packing") });
     // It parks in the hall: there two more may be out, and at packing none.
-    let parked = |s: Said| if s.robot_id == robot(20) { said(20, "hall") } else { s };
+    let parked = |s: RobotReport| if s.robot_id == robot(20) { report(20, "hall") } else { s };
     judge.judge_reports(NOW, &all().into_iter().map(parked).collect::<Vec<_>>());
     [drain(0, "hall"), drain(1, "hall")].into_iter().for_each(|d| judge.drain(d));
     assert_eq!(judge.take_seen().broken, Vec::<String>::new());
@@ -124,7 +124,7 @@ fn a_robot_counts_for_the_area_that_it_was_taken_from_until_its_drain_is_no_more
 #[test]
 fn robots_that_left_an_area_a_while_ago_are_no_budget_of_it() {
     let mut judge = judge();
-    let left = |from: usize| (0..20).map(|n| said(n, if n < from { "hall" } else { "packing" })).collect::<Vec<_>>();
+    let left = |from: usize| (0..20).map(|n| report(n, if n < from { "hall" } else { "packing" })).collect::<Vec<_>>();
     judge.judge_reports(LinkTime(NOW.0 + 5_000), &left(19));
     [drain(0, "hall"), drain(1, "hall")].into_iter().for_each(|d| judge.drain(d));
     assert_eq!(judge.take_seen().broken, Vec::<String>::new(), "a planner may have seen the twentieth there");
@@ -143,7 +143,7 @@ fn a_way_back_waits_for_drains_alone_that_end_by_themselves_and_an_urgent_one_fo
     assert_eq!(waits.take_seen().broken.len(), 1, "its turn comes when the other is back");
 
     let mut stuck = judge();
-    let is_stuck = |s: Said| Said { is_stuck: s.robot_id == robot(20), ..s };
+    let is_stuck = |s: RobotReport| RobotReport { is_stuck: s.robot_id == robot(20), ..s };
     stuck.judge_reports(NOW, &all().into_iter().map(is_stuck).collect::<Vec<_>>());
     stuck.drain(drain(20, "packing"));
     stuck.drain(back(21));
@@ -180,8 +180,8 @@ fn no_more_are_out_of_work_than_the_wave_has_or_the_roll_out_was_asked_for() {
 fn software_that_changes_in_no_drain_is_an_objection_at_the_second_heartbeat() {
     let later = LinkTime(NOW.0 + 1_000);
     let heard = |at: LinkTime| {
-        let changes = |s: Said| Said { changes: s.robot_id == robot(3), heard: at, ..s };
-        all().into_iter().map(changes).collect::<Vec<Said>>()
+        let changes = |s: RobotReport| RobotReport { changes: s.robot_id == robot(3), heard: at, ..s };
+        all().into_iter().map(changes).collect::<Vec<RobotReport>>()
     };
     let mut inside = judge();
     inside.drain(drain(3, "hall"));
