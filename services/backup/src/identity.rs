@@ -1,7 +1,7 @@
 //! The site's authority and the server's own key.
 
 use super::files::{blocking, copy, entries};
-use super::part::{Making, Part, Places, Said};
+use super::part::{BackupFacts, Making, Part, Places};
 use anyhow::ensure;
 use async_trait::async_trait;
 use midshift_identity::{FOLDER, RevocationList};
@@ -20,7 +20,7 @@ impl Part for Identity {
     fn name(&self) -> &'static str {
         FOLDER
     }
-    async fn copy(&self, from: &Places, folder: &Path, _said: &mut Said) -> anyhow::Result<bool> {
+    async fn copy(&self, from: &Places, folder: &Path, _facts: &mut BackupFacts) -> anyhow::Result<bool> {
         let (from, folder) = (from.data.join(FOLDER), folder.to_owned());
         blocking(move || {
             if !from.is_dir() {

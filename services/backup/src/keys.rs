@@ -1,7 +1,7 @@
 //! Online keys.
 
 use super::files::{blocking, copy, entries};
-use super::part::{KEYS, Making, Part, Places, Said};
+use super::part::{BackupFacts, KEYS, Making, Part, Places};
 use anyhow::ensure;
 use async_trait::async_trait;
 use std::fs;
@@ -18,7 +18,7 @@ impl Part for OnlineKeys {
     fn name(&self) -> &'static str {
         KEYS
     }
-    async fn copy(&self, from: &Places, folder: &Path, _said: &mut Said) -> anyhow::Result<bool> {
+    async fn copy(&self, from: &Places, folder: &Path, _facts: &mut BackupFacts) -> anyhow::Result<bool> {
         let Some(keys) = from.ota_keys.clone() else { return Ok(false) };
         let folder = folder.to_owned();
         blocking(move || {

@@ -24,8 +24,8 @@ use midshift_bundle::digest::Digest;
 use midshift_core::Boxed;
 use midshift_core::time::Utc;
 use midshift_store::{PostgresRestore, RestoreError, StoreId};
+use part::{BackupFacts, Making, POSTGRES};
 pub use part::{KEYS, Places};
-use part::{Making, POSTGRES, Said};
 use parts::PARTS;
 use serde::{Deserialize, Serialize};
 use staging::Staging;
@@ -84,15 +84,15 @@ pub fn back_up<'a>(from: &'a Places, to: &'a Path, now: Utc) -> Boxed<'a, anyhow
     Box::pin(async move {
         let place = Staging::new(to)?;
         let mut names = Vec::new();
-        let mut said = Said::default();
+        let mut facts = BackupFacts::default();
         for part in PARTS {
             let folder = place.path().join(part.name());
-            let copied = part.copy(from, &folder, &mut said).await;
+            let copied = part.copy(from, &folder, &mut facts).await;
             if copied.with_context(|| format!("copying {}", part.name()))? {
                 names.push(part.name().to_owned());
             }
         }
-        let site_id = said.site_id.with_context(|| format!("no server ever served from {}", from.data.display()))?;
+        let site_id = facts.site_id.with_context(|| format!("no server ever served from {}", from.data.display()))?;
         let root = place.path().to_owned();
         let files = blocking(move || listed(&root)).await?;
         let midshift = env!("CARGO_PKG_VERSION").to_owned();

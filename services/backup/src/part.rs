@@ -1,4 +1,4 @@
-//! What each durable thing of a server can do for a backup, and what those that are copied or put back tell each other.
+//! Defines a part of a backup: one durable thing of a server, and the facts that parts pass on while they are copied or put back.
 
 use async_trait::async_trait;
 use midshift_core::time::Utc;
@@ -21,9 +21,9 @@ pub struct Places {
     pub store: Option<PostgresConfig>,
 }
 
-/// What parts that were copied tell those after them.
+/// The facts that copied parts pass on to those after them.
 #[derive(Debug, Default)]
-pub struct Said {
+pub struct BackupFacts {
     /// Whose the rows are.
     pub site_id: Option<String>,
     /// Whose the folder of releases must be, if the rows are not beside it.
@@ -50,7 +50,7 @@ pub trait Part: Send + Sync {
     /// Its name, and that of its folder.
     fn name(&self) -> &'static str;
     /// Copies it; false: the server has none.
-    async fn copy(&self, from: &Places, folder: &Path, said: &mut Said) -> anyhow::Result<bool>;
+    async fn copy(&self, from: &Places, folder: &Path, facts: &mut BackupFacts) -> anyhow::Result<bool>;
     /// What is wrong with a copy.
     async fn check(&self, folder: &Path) -> anyhow::Result<Vec<String>>;
     /// Makes it what a server can start from.

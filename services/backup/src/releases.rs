@@ -1,7 +1,7 @@
 //! Signed documents of releases, and their files.
 
 use super::files::{blocking, copy, copy_if_there, entries, must, read};
-use super::part::{Making, Part, Places, Said};
+use super::part::{BackupFacts, Making, Part, Places};
 use anyhow::ensure;
 use async_trait::async_trait;
 use midshift_bundle::digest::Digest;
@@ -28,9 +28,9 @@ impl Part for Releases {
     fn name(&self) -> &'static str {
         RELEASES
     }
-    async fn copy(&self, from: &Places, folder: &Path, said: &mut Said) -> anyhow::Result<bool> {
+    async fn copy(&self, from: &Places, folder: &Path, facts: &mut BackupFacts) -> anyhow::Result<bool> {
         let (from, folder) = (from.data.join(RELEASES), folder.to_owned());
-        let (owner, bundles) = (said.store_id.clone(), said.bundles);
+        let (owner, bundles) = (facts.store_id.clone(), facts.bundles);
         blocking(move || {
             let is_begun = || [DOCUMENTS, FILES].iter().any(|part| from.join(part).is_dir());
             if !from.is_dir() || (owner.is_some() && !is_begun()) {

@@ -1,7 +1,7 @@
 //! Rows and samples: two files of SQLite, or two schemas of PostgreSQL.
 
 use super::files::{blocking, must, write};
-use super::part::{Making, POSTGRES, Part, Places, Said};
+use super::part::{BackupFacts, Making, POSTGRES, Part, Places};
 use anyhow::{Context, bail};
 use async_trait::async_trait;
 use midshift_store::{Database, PostgresCopy, PostgresRestore, StoreId};
@@ -25,14 +25,14 @@ impl Part for Rows {
             Database::Telemetry => "telemetry",
         }
     }
-    async fn copy(&self, from: &Places, folder: &Path, said: &mut Said) -> anyhow::Result<bool> {
+    async fn copy(&self, from: &Places, folder: &Path, facts: &mut BackupFacts) -> anyhow::Result<bool> {
         if from.store.is_some() || !from.data.join(self.0.file()).is_file() {
             return Ok(false);
         }
         fs::create_dir_all(folder)?;
         self.0.copy(&from.data, &self.file(folder)).await?;
         if self.0 == Database::Control {
-            said.site_id = self.0.inspect(&self.file(folder)).await?.0.site_id;
+            facts.site_id = self.0.inspect(&self.file(folder)).await?.0.site_id;
         }
         Ok(true)
     }
@@ -64,16 +64,16 @@ impl Part for Schemas {
     fn name(&self) -> &'static str {
         POSTGRES
     }
-    async fn copy(&self, from: &Places, folder: &Path, said: &mut Said) -> anyhow::Result<bool> {
+    async fn copy(&self, from: &Places, folder: &Path, facts: &mut BackupFacts) -> anyhow::Result<bool> {
         let Some(config) = &from.store else { return Ok(false) };
         fs::create_dir_all(folder)?;
         let Some(copy) = PostgresCopy::begin(config, folder).await? else {
             bail!("no server ever served from this database")
         };
         write(&folder.join(COPIED), &serde_json::to_vec_pretty(&copy)?)?;
-        said.bundles = copy.rows("bundle").unwrap_or(0);
-        said.store_id = Some(StoreId(copy.store_id.into()));
-        said.site_id = Some(copy.site_id);
+        facts.bundles = copy.rows("bundle").unwrap_or(0);
+        facts.store_id = Some(StoreId(copy.store_id.into()));
+        facts.site_id = Some(copy.site_id);
         Ok(true)
     }
     async fn check(&self, folder: &Path) -> anyhow::Result<Vec<String>> {

@@ -4,7 +4,7 @@
 //! have not heard of the reset; those that have do not obey it, and say so. It is reset by name once more. A stop that came later is brought back by robots, who keep it themselves, and taken from them because the key is the same.
 
 use super::files::{blocking, copy, copy_if_there, entries};
-use super::part::{Making, Part, Places, Said};
+use super::part::{BackupFacts, Making, Part, Places};
 use anyhow::{Context, ensure};
 use async_trait::async_trait;
 use midshift_core::stop::{FOLDER, LOG};
@@ -29,7 +29,7 @@ impl Part for Stops {
     fn name(&self) -> &'static str {
         FOLDER
     }
-    async fn copy(&self, from: &Places, folder: &Path, _said: &mut Said) -> anyhow::Result<bool> {
+    async fn copy(&self, from: &Places, folder: &Path, _facts: &mut BackupFacts) -> anyhow::Result<bool> {
         let (from, folder) = (from.data.join(FOLDER), folder.to_owned());
         blocking(move || {
             let (has_latch, has_key) = (is_there(&from.join(LATCH))?, is_there(&from.join(KEY))?);
@@ -114,9 +114,9 @@ mod tests {
         let latch = from.data.join(FOLDER).join(LATCH);
         fs::create_dir_all(from.data.join(FOLDER)).expect("a folder");
         let to = dir.path().join("backup");
-        assert!(!Stops.copy(&from, &to, &mut Said::default()).await.expect("there is nothing"));
+        assert!(!Stops.copy(&from, &to, &mut BackupFacts::default()).await.expect("there is nothing"));
         std::os::unix::fs::symlink(&latch, &latch).expect("a link to itself");
-        let error = Stops.copy(&from, &to, &mut Said::default()).await.expect_err("nobody knows");
+        let error = Stops.copy(&from, &to, &mut BackupFacts::default()).await.expect_err("nobody knows");
         assert!(format!("{error:#}").contains(LATCH), "{error:#}");
     }
 }
