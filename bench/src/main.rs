@@ -78,19 +78,19 @@ fn main() -> anyhow::Result<()> {
         Name::Link(args) => wait(link::run(args, &note))?,
         Name::Gates(args) => gates::run(args)?,
         Name::Ota(args) => {
-            let told = wait(async { Ok(ota::run(args, &note).await) })?;
-            failed = told.failed;
-            told.figures
+            let outcome = wait(async { Ok(ota::run(args, &note).await) })?;
+            failed = outcome.failed;
+            outcome.figures
         }
         Name::Stop(args) => {
-            let told = wait(async { Ok(stop::run(args, &note).await) })?;
-            failed = told.failed;
-            told.figures
+            let outcome = wait(async { Ok(stop::run(args, &note).await) })?;
+            failed = outcome.failed;
+            outcome.figures
         }
         Name::Edge(args) => {
-            let told = wait(async { Ok(edge::run(args, &note).await) })?;
-            failed = told.failed;
-            told.figures
+            let outcome = wait(async { Ok(edge::run(args, &note).await) })?;
+            failed = outcome.failed;
+            outcome.figures
         }
         Name::Watch(args) => wait(watch::run(args, &note))?,
         Name::Child(args) => return roles::play(args),

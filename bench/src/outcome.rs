@@ -5,14 +5,14 @@ use tokio::signal::unix::{SignalKind, signal};
 
 /// What was measured, and what could not be.
 #[derive(Debug, Default)]
-pub struct Told {
+pub struct RunOutcome {
     /// Of the parts that could.
     pub figures: Vec<Figure>,
     /// Each part that could not, and why.
     pub failed: Vec<String>,
 }
 
-impl Told {
+impl RunOutcome {
     /// Adds a part that was measured, or why it was not.
     pub fn add(&mut self, part: &str, measured: anyhow::Result<Vec<Figure>>) {
         match measured {

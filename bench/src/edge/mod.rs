@@ -8,7 +8,7 @@ mod load;
 
 use crate::child::Child;
 use crate::figure::{Figure, percentile};
-use crate::outcome::{Told, unless_stopped};
+use crate::outcome::{RunOutcome, unless_stopped};
 use anyhow::{Context, ensure};
 use hostile::{ANSWERED, REFUSED, THERE, TURNED_AWAY};
 use load::Load;
@@ -93,19 +93,19 @@ pub async fn play(part: Part, address: SocketAddr, stop: CancellationToken) -> a
 }
 
 /// Runs every load. What cannot be made here is named and takes no other with it; Ctrl-C and SIGTERM end all.
-pub async fn run(args: EdgeArgs, say: &dyn Fn(&str)) -> Told {
-    let mut told = Told::default();
-    let ended = unless_stopped(all(&args, &mut told, say)).await;
-    told.failed.extend(ended);
-    told
+pub async fn run(args: EdgeArgs, say: &dyn Fn(&str)) -> RunOutcome {
+    let mut outcome = RunOutcome::default();
+    let ended = unless_stopped(all(&args, &mut outcome, say)).await;
+    outcome.failed.extend(ended);
+    outcome
 }
 
-async fn all(args: &EdgeArgs, told: &mut Told, say: &dyn Fn(&str)) {
+async fn all(args: &EdgeArgs, outcome: &mut RunOutcome, say: &dyn Fn(&str)) {
     let loads = if args.load.is_empty() { Load::ALL.to_vec() } else { args.load.clone() };
     for load in loads {
         let name = format!("{} {}", peers(args, load), load.words());
         say(&name);
-        told.add(&name, measure(args, load).await.map(|turns| turns.figures(&name)));
+        outcome.add(&name, measure(args, load).await.map(|turns| turns.figures(&name)));
     }
 }
 

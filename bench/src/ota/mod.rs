@@ -20,26 +20,26 @@ pub mod swarm;
 
 pub use args::OtaArgs;
 
-use crate::outcome::{Told, unless_stopped};
+use crate::outcome::{RunOutcome, unless_stopped};
 use args::What;
 
 /// Runs the parts that were asked for. One that fails takes no other with it; Ctrl-C and SIGTERM end all of them, and what they made goes.
-pub async fn run(args: OtaArgs, say: &dyn Fn(&str)) -> Told {
-    let mut told = Told::default();
-    let ended = unless_stopped(parts(&args, &mut told, say)).await;
-    told.failed.extend(ended);
-    told
+pub async fn run(args: OtaArgs, say: &dyn Fn(&str)) -> RunOutcome {
+    let mut outcome = RunOutcome::default();
+    let ended = unless_stopped(parts(&args, &mut outcome, say)).await;
+    outcome.failed.extend(ended);
+    outcome
 }
 
-async fn parts(args: &OtaArgs, told: &mut Told, say: &dyn Fn(&str)) {
+async fn parts(args: &OtaArgs, outcome: &mut RunOutcome, say: &dyn Fn(&str)) {
     let dir = args.dir.as_ref();
     if matches!(args.part, What::Server | What::All) {
-        told.add("server", server::run(args, say).await);
+        outcome.add("server", server::run(args, say).await);
     }
     if matches!(args.part, What::Device | What::All) {
-        told.add("device", device::run(&args.device, dir).await);
+        outcome.add("device", device::run(&args.device, dir).await);
     }
     if matches!(args.part, What::Line | What::All) {
-        told.add("line", line::run(&args.line, dir).await);
+        outcome.add("line", line::run(&args.line, dir).await);
     }
 }

@@ -15,7 +15,7 @@ mod turns;
 pub use turns::StopArgs;
 
 use crate::link;
-use crate::outcome::{Told, unless_stopped};
+use crate::outcome::{RunOutcome, unless_stopped};
 use beside::Beside;
 use midshift_core::limits::CONNECTIONS_MAX;
 use midshift_process::door::Share;
@@ -74,14 +74,14 @@ pub async fn play(part: Part, address: SocketAddr, stop: CancellationToken) -> a
 }
 
 /// Runs every size and situation. What cannot be made here is named and takes no other with it; Ctrl-C and SIGTERM end all, and what was made goes.
-pub async fn run(args: StopArgs, say: &dyn Fn(&str)) -> Told {
-    let mut told = Told::default();
-    let ended = unless_stopped(all(&args, &mut told, say)).await;
-    told.failed.extend(ended);
-    told
+pub async fn run(args: StopArgs, say: &dyn Fn(&str)) -> RunOutcome {
+    let mut outcome = RunOutcome::default();
+    let ended = unless_stopped(all(&args, &mut outcome, say)).await;
+    outcome.failed.extend(ended);
+    outcome
 }
 
-async fn all(args: &StopArgs, told: &mut Told, say: &dyn Fn(&str)) {
+async fn all(args: &StopArgs, outcome: &mut RunOutcome, say: &dyn Fn(&str)) {
     let sizes = if args.robots.is_empty() { ROBOTS.to_vec() } else { args.robots.clone() };
     for wanted in sizes {
         let robots = match link::allowed(Some(wanted)) {
@@ -89,16 +89,17 @@ async fn all(args: &StopArgs, told: &mut Told, say: &dyn Fn(&str)) {
                 note.iter().for_each(|note| say(note));
                 robots
             }
-            Err(error) => return told.failed.push(format!("{error:#}")),
+            Err(error) => return outcome.failed.push(format!("{error:#}")),
         };
         let site = match proven(args, robots).await {
             Ok(site) => site,
-            Err(error) => return told.failed.push(format!("{robots} robots are not enrolled: {error:#}")),
+            Err(error) => return outcome.failed.push(format!("{robots} robots are not enrolled: {error:#}")),
         };
         for beside in Beside::all(&args.beside) {
             let name = format!("{robots} robots, {}", beside.words());
             say(&name);
-            told.add(&name, scene::measure(args, &site, robots, beside, say).await.map(|turns| turns.figures(&name)));
+            outcome
+                .add(&name, scene::measure(args, &site, robots, beside, say).await.map(|turns| turns.figures(&name)));
         }
     }
 }
