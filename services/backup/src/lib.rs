@@ -6,6 +6,7 @@
 //! adds its part.
 
 mod access;
+pub mod audit_notices;
 mod files;
 mod identity;
 mod keys;
@@ -15,7 +16,6 @@ mod releases;
 mod rows;
 mod staging;
 mod stops;
-pub mod told;
 
 pub use access::{Access, Identity, Settled};
 use anyhow::{Context, bail, ensure};

@@ -242,7 +242,7 @@ async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow
     let served = tokio::select! {
         served = server.serve(listener) => served,
         () = keep_stop(beside, &*rows) => Ok(()),
-        () = midshift_backup::told::run(&args.data, &*rows) => Ok(()),
+        () = midshift_backup::audit_notices::run(&args.data, &*rows) => Ok(()),
         () = clock_jump::save_jumps(&args.data, &*clock) => Ok(()),
         () = clock_doubt::run(&args.data, &*clock, &*rows) => Ok(()),
     };

@@ -58,7 +58,7 @@ pub async fn back_up(args: &Take, out: &Out) -> Result<(), Exit> {
     let summary = midshift_backup::back_up(&from, &args.to, clock::clock(1000).now().wall).await?;
     show(&summary, None, out)?;
     // The backup is whole, whether or not that can be said.
-    if let Err(error) = midshift_backup::told::leave_note(&from.data, &summary, &args.to) {
+    if let Err(error) = midshift_backup::audit_notices::leave_note(&from.data, &summary, &args.to) {
         out.inform(&format!("warning: the audit will have no row of this backup: {error:#}"));
     }
     out.next(&format!("midshift restore --verify --from {}", word(&args.to.to_string_lossy())));
@@ -76,7 +76,7 @@ pub async fn restore(args: &Restore, out: &Out) -> Result<(), Exit> {
     let to = Places { data, ota_keys: args.ota_keys.clone(), store: args.database.postgres()? };
     let access = Access { revocations: args.revocations.clone(), identity: args.identity };
     let (summary, settled) = midshift_backup::restore(&args.from, &to, &access, clock::clock(1000).now().wall).await?;
-    if let Err(error) = midshift_backup::told::leave_restored(&to.data, &args.from, &access, &settled) {
+    if let Err(error) = midshift_backup::audit_notices::leave_restored(&to.data, &args.from, &access, &settled) {
         out.inform(&format!("warning: the audit will have no row of this restore: {error:#}"));
     }
     show(&summary, Some(&settled), out)?;

@@ -1,4 +1,4 @@
-//! Tells the server of a data directory that a backup of it was made, or that it was restored, and leaves the row of the audit for it.
+//! Leaves a notice for the server that a backup of its data directory was made or restored, and writes the row of the audit for it.
 //!
 //! Invariant: whoever copies files writes no rows: the store belongs to the server. The backup leaves a small file in the data directory, and a server
 //! with it, now or at its next start, writes the row and then takes the file away. A row is never lost, and comes once in each life of a server at most.
