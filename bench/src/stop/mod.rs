@@ -2,9 +2,9 @@
 //! same load.
 //!
 //! Invariant: the stop service is a process of its own on the first core, as is the bare loop; robots are on the others; robots' check-ins go on in the turns of both.
-//! Called by `main`. Rooms: `turns` has the turns and their figures; `beside` and `scene` are what goes on beside; `site` who may come in; `robots`, `fan` and `pull` are children.
+//! Called by `main`. Rooms: `turns` has the turns and their figures; `disturbance` and `scene` are what goes on beside; `site` who may come in; `robots`, `fan` and `pull` are children.
 
-mod beside;
+mod disturbance;
 mod fan;
 mod pull;
 mod robots;
@@ -16,7 +16,7 @@ pub use turns::StopArgs;
 
 use crate::link;
 use crate::outcome::{RunOutcome, unless_stopped};
-use beside::Beside;
+use disturbance::Disturbance;
 use midshift_core::limits::CONNECTIONS_MAX;
 use midshift_process::door::Share;
 use site::Site;
@@ -95,11 +95,13 @@ async fn all(args: &StopArgs, outcome: &mut RunOutcome, say: &dyn Fn(&str)) {
             Ok(site) => site,
             Err(error) => return outcome.failed.push(format!("{robots} robots are not enrolled: {error:#}")),
         };
-        for beside in Beside::all(&args.beside) {
-            let name = format!("{robots} robots, {}", beside.words());
+        for disturbance in Disturbance::all(&args.beside) {
+            let name = format!("{robots} robots, {}", disturbance.words());
             say(&name);
-            outcome
-                .add(&name, scene::measure(args, &site, robots, beside, say).await.map(|turns| turns.figures(&name)));
+            outcome.add(
+                &name,
+                scene::measure(args, &site, robots, disturbance, say).await.map(|turns| turns.figures(&name)),
+            );
         }
     }
 }

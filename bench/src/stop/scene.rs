@@ -2,7 +2,7 @@
 //!
 //! Invariant: the load is there in the turns of both; whatever was mounted or stopped is unmounted or goes on however the measurement ends.
 
-use super::beside::Beside;
+use super::disturbance::Disturbance;
 use super::site::Site;
 use super::turns::{StopArgs, Turns, text, turns};
 use crate::child::Child;
@@ -37,18 +37,18 @@ pub async fn measure(
     args: &StopArgs,
     site: &Site,
     robots: usize,
-    beside: Beside,
+    disturbance: Disturbance,
     say: &dyn Fn(&str),
 ) -> anyhow::Result<Turns> {
     let room = place(args.dir.as_ref())?;
     let stops = room.path().join("stops");
-    match beside {
-        Beside::Nothing => turns(args, site, robots, &stops, room.path(), async || Ok(())).await,
-        Beside::Ingest => ingest(args, site, robots, room.path(), say).await,
-        Beside::Bulk => bulk(args, site, robots, room.path(), say).await,
-        Beside::Database => database(args, site, robots, room.path()).await,
-        Beside::Disk => disk(args, site, robots, room.path()).await,
-        Beside::Kill => kill(args, site, robots, room.path()).await,
+    match disturbance {
+        Disturbance::Nothing => turns(args, site, robots, &stops, room.path(), async || Ok(())).await,
+        Disturbance::Ingest => ingest(args, site, robots, room.path(), say).await,
+        Disturbance::Bulk => bulk(args, site, robots, room.path(), say).await,
+        Disturbance::Database => database(args, site, robots, room.path()).await,
+        Disturbance::Disk => disk(args, site, robots, room.path()).await,
+        Disturbance::Kill => kill(args, site, robots, room.path()).await,
     }
 }
 

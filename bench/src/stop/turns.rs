@@ -1,6 +1,6 @@
 //! Turns of a stop and of a bare write loop, each with the same robots.
 
-use super::beside::Beside;
+use super::disturbance::Disturbance;
 use super::fan;
 use super::robots::{ANSWERED, ATTACHED, FREE, Moments, STAND, TAKE, TAKE_BARE};
 use super::site::Site;
@@ -30,7 +30,7 @@ pub struct StopArgs {
     pub robots: Vec<usize>,
     /// What goes on beside; more than once: each by itself. Without it all of them.
     #[arg(long, value_enum)]
-    pub beside: Vec<Beside>,
+    pub beside: Vec<Disturbance>,
     /// Turns of each: a stop, a bare write loop.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=100))]
     pub rounds: u64,

@@ -1,8 +1,8 @@
-//! What goes on beside a stop.
+//! Lists what disturbs the machine while a stop is measured.
 
-/// What goes on beside.
+/// What disturbs the machine while a stop is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum Beside {
+pub enum Disturbance {
     /// Nothing: no server at all.
     Nothing,
     /// A server at the knee of its ingest.
@@ -17,11 +17,11 @@ pub enum Beside {
     Kill,
 }
 
-impl Beside {
+impl Disturbance {
     /// Those that were asked for, or all.
     pub fn all(asked: &[Self]) -> Vec<Self> {
         let all = [Self::Nothing, Self::Ingest, Self::Bulk, Self::Database, Self::Disk, Self::Kill];
-        all.into_iter().filter(|beside| asked.is_empty() || asked.contains(beside)).collect()
+        all.into_iter().filter(|disturbance| asked.is_empty() || asked.contains(disturbance)).collect()
     }
     /// For names of figures.
     pub fn words(self) -> &'static str {
