@@ -77,13 +77,13 @@ pub async fn run(args: &OldArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figur
     for engine in args.engine.engines(say) {
         let empty = rounds(args, &engine, 0, say).await?;
         let old = rounds(args, &engine, args.ended, say).await?;
-        figures.extend(told(args, &engine, 0, &empty, &empty));
-        figures.extend(told(args, &engine, args.ended, &old, &empty));
+        figures.extend(figures_of(args, &engine, 0, &empty, &empty));
+        figures.extend(figures_of(args, &engine, args.ended, &old, &empty));
     }
     Ok(figures)
 }
 
-fn told(args: &OldArgs, engine: &Engine, ended: u64, rounds: &Rounds, empty: &Rounds) -> Vec<Figure> {
+fn figures_of(args: &OldArgs, engine: &Engine, ended: u64, rounds: &Rounds, empty: &Rounds) -> Vec<Figure> {
     let name = |what: &str| format!("{ended} ended tasks, {what}{}", engine.suffix());
     let raw = Some((engine.limit(), rounds.raw_ms.as_slice()));
     let beside = |of: fn(&Rounds) -> &Vec<f64>| Some(("of an empty store", of(empty).as_slice()));
@@ -127,7 +127,7 @@ async fn rounds(args: &OldArgs, engine: &Engine, ended: u64, say: &dyn Fn(&str))
         rounds.offer_ms.push(first_offer_ms(&server, &site, &format!("first-{round}")).await?);
         rounds.rss_mib.push(server.rss_kib()? / 1_024.0);
         rounds.raw_ms.extend(bed_raw_ms(&bed, round).await?);
-        for (rounds, asked) in rounds.asked_ms.iter_mut().zip(asked(args, &server, &site, round).await?) {
+        for (rounds, asked) in rounds.asked_ms.iter_mut().zip(measure_answers(args, &server, &site, round).await?) {
             rounds.push(asked);
         }
         match bed.url() {
@@ -183,7 +183,7 @@ async fn takeover_ms(bed: &Bed<'_>, map: &Path, site: &Site, plans: Child, round
 }
 
 /// Milliseconds of explanations of a robot and of a task, and of commands, asked one at a time while robots are given work.
-async fn asked(args: &OldArgs, server: &Child, site: &Site, round: usize) -> anyhow::Result<[Vec<f64>; 3]> {
+async fn measure_answers(args: &OldArgs, server: &Child, site: &Site, round: usize) -> anyhow::Result<[Vec<f64>; 3]> {
     let address = server.address.to_string();
     let mut robots = JoinSet::new();
     for number in 0..args.robots {

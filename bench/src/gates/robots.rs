@@ -108,13 +108,13 @@ pub fn computed() -> Vec<Figure> {
         ("clean robots that promote", first(0, Verdict::Promote), DESIGN_SEQUENTIAL.1),
         ("robots that promote with 1 failure", first(1, Verdict::Promote), DESIGN_SEQUENTIAL.2),
     ];
-    let told =
+    let figure =
         |name: String, unit, ours: f64, design: f64| Figure::new("G2", name, unit, &[ours], Some((DESIGN, &[design])));
     let anchors =
-        anchors.map(|(name, ours, design)| told(format!("SPRT, {name}"), "robots", ours.into(), design.into()));
+        anchors.map(|(name, ours, design)| figure(format!("SPRT, {name}"), "robots", ours.into(), design.into()));
     let bounds = DESIGN_BOUNDS.map(|(clean, design)| {
         let ours = f64::from(upper_bound_permille(of(clean, 0))) / 10.0;
-        told(format!("95 % bound of the failure rate, {clean} clean"), "%", ours, design)
+        figure(format!("95 % bound of the failure rate, {clean} clean"), "%", ours, design)
     });
     anchors.into_iter().chain(bounds).collect()
 }
@@ -124,10 +124,10 @@ pub fn naive(seed: u64, runs: usize) -> Vec<Figure> {
     let rule = format!("naive, more than {} % of {}", NAIVE.1, NAIVE.0);
     let aborted = share(&many(naive_rule, 0.02, NAIVE.0, (seed, 1), runs), Verdict::Abort);
     let missed = share(&many(naive_rule, 0.10, NAIVE.0, (seed, 2), runs), Verdict::Promote);
-    let told = |name, estimate, design| Figure::simulated("G0", name, "%", estimate, Some((DESIGN, design)));
+    let figure = |name, estimate, design| Figure::simulated("G0", name, "%", estimate, Some((DESIGN, design)));
     vec![
-        told(format!("{rule}: aborts at 2 %"), aborted, DESIGN_NAIVE.0),
-        told(format!("{rule}: passes at 10 %"), missed, DESIGN_NAIVE.1),
+        figure(format!("{rule}: aborts at 2 %"), aborted, DESIGN_NAIVE.0),
+        figure(format!("{rule}: passes at 10 %"), missed, DESIGN_NAIVE.1),
     ]
 }
 
@@ -145,7 +145,7 @@ pub fn sequential(seed: u64, runs: usize) -> Vec<Figure> {
                     false => (Verdict::Inconclusive, fleet),
                 })
                 .collect();
-            figures.extend(told("SPRT", rate, fleet, &cut, exactly(RobotOutcomes::verdict, rate, fleet)));
+            figures.extend(figures_of("SPRT", rate, fleet, &cut, exactly(RobotOutcomes::verdict, rate, fleet)));
         }
     }
     figures
@@ -162,13 +162,13 @@ pub fn first_failure(seed: u64, runs: usize) -> Vec<Figure> {
     }
     for (rate, kind) in RATES.into_iter().zip(300..) {
         let ends = many(first_failure_rule, rate, 60, (seed, kind), runs);
-        figures.extend(told("first failure, SPRT", rate, 60, &ends, exactly(first_failure_rule, rate, 60)));
+        figures.extend(figures_of("first failure, SPRT", rate, 60, &ends, exactly(first_failure_rule, rate, 60)));
     }
     figures
 }
 
 /// Shares of each end and the robots touched, beside their exact values.
-fn told(rule: &str, rate: f64, fleet: u32, ends: &[(Verdict, u32)], exact: Ends) -> Vec<Figure> {
+fn figures_of(rule: &str, rate: f64, fleet: u32, ends: &[(Verdict, u32)], exact: Ends) -> Vec<Figure> {
     let name = |what: &str| format!("{rule}, {:.0} %, n <= {fleet}: {what}", rate * 100.0);
     let open = (1.0 - exact.abort - exact.promote).max(0.0);
     let shares = [

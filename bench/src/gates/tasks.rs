@@ -88,13 +88,13 @@ fn share(ends: &[End], has: impl Fn(&End) -> bool) -> Estimate {
 pub fn figures(seed: u64, runs: usize) -> anyhow::Result<Vec<Figure>> {
     let names = (0..ROBOTS).map(|n| RobotId::parse(&format!("rbt-{n:02}")));
     let names = &names.collect::<Result<Vec<_>, _>>()?;
-    let told = |name: String, unit, estimate, limit| Figure::simulated("G4", name, unit, estimate, limit);
+    let figure = |name: String, unit, estimate, limit| Figure::simulated("G4", name, unit, estimate, limit);
     let mut figures = Vec::new();
     for (name, waves, kind) in [("in waves", &WAVES[..], 400), ("canary of 6", &CANARY[..], 401)] {
         let ends = Shift { names, waves, ratio: |_| 1.0 }.many(seed, kind, runs);
         let what = format!("tasks, no worse, {name}, {HORIZON} a robot");
-        figures.push(told(format!("{what}: E reaches 20"), "%", share(&ends, |e| e.reached), Some(VILLE)));
-        figures.push(told(
+        figures.push(figure(format!("{what}: E reaches 20"), "%", share(&ends, |e| e.reached), Some(VILLE)));
+        figures.push(figure(
             format!("{what}: release accused"),
             "%",
             share(&ends, |e| e.accused_after.is_some()),
@@ -103,21 +103,26 @@ pub fn figures(seed: u64, runs: usize) -> anyhow::Result<Vec<Figure>> {
     }
     let sick = |robot| if robot == 0 { 20.0 } else { 1.0 };
     let ends = Shift { names, waves: &CANARY, ratio: sick }.many(seed, 402, runs);
-    figures.push(told(
+    figures.push(figure(
         "tasks, one robot 20 times as often: told to be sick".into(),
         "%",
         share(&ends, |e| e.sick_robot),
         None,
     ));
     let accused = share(&ends, |e| e.accused_after.is_some());
-    figures.push(told("tasks, one robot 20 times as often: release accused".into(), "%", accused, Some(VILLE)));
+    figures.push(figure("tasks, one robot 20 times as often: release accused".into(), "%", accused, Some(VILLE)));
     let worse: [(u32, Ratio); 3] = [(2, |_| 2.0), (3, |_| 3.0), (5, |_| 5.0)];
     for ((times, ratio), kind) in worse.into_iter().zip(403..) {
         let ends = Shift { names, waves: &CANARY, ratio }.many(seed, kind, runs);
         let delays: Vec<f64> = ends.iter().filter_map(|e| e.accused_after).map(|tasks| tasks as f64).collect();
         let what = format!("tasks, {times} times as often, canary of 6");
-        figures.push(told(format!("{what}: release accused"), "%", share(&ends, |e| e.accused_after.is_some()), None));
-        figures.push(told(format!("{what}: accused after"), "tasks", Estimate::mean(&delays), None));
+        figures.push(figure(
+            format!("{what}: release accused"),
+            "%",
+            share(&ends, |e| e.accused_after.is_some()),
+            None,
+        ));
+        figures.push(figure(format!("{what}: accused after"), "tasks", Estimate::mean(&delays), None));
     }
     Ok(figures)
 }

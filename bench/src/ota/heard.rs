@@ -136,8 +136,13 @@ impl Watcher {
     }
 }
 
-/// When the server had this fault of a robot durable as an event, the first one from a moment on; UTC unix ms. None: not yet.
-pub async fn told_ms(channel: Channel, robot_id: &str, code: u32, from_ms: i64) -> anyhow::Result<Option<i64>> {
+/// Finds when the server had this fault of a robot durable as an event, the first one from a moment on; UTC unix ms. None: not yet.
+pub async fn fault_durable_ms(
+    channel: Channel,
+    robot_id: &str,
+    code: u32,
+    from_ms: i64,
+) -> anyhow::Result<Option<i64>> {
     let mut client = TelemetryServiceClient::new(channel);
     let mut cursor = String::new();
     loop {

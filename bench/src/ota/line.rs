@@ -5,7 +5,7 @@
 //! only asks and measures answers, and bare TCP. Outside: a real server. All clocks are this machine's.
 //! Invariant: it ends by itself, and nothing of it stays: processes and namespace go with the future, however it ends.
 
-use super::heard::{Ages, Watcher, ages, told_ms};
+use super::heard::{Ages, Watcher, ages, fault_durable_ms};
 use super::netns::{self, Namespace};
 use super::noise::{Release, Releases};
 use super::parts::{JAM, LEAVE, MEND, PULL, TAKE, Taken};
@@ -244,7 +244,7 @@ impl<'a> Stage<'a> {
         // The heartbeat does not wait until the event is durable.
         let end = Instant::now() + WITHIN;
         let event = loop {
-            if let Some(event) = told_ms(self.channel.clone(), ROBOT, FAULT_JAM, jammed_ms).await? {
+            if let Some(event) = fault_durable_ms(self.channel.clone(), ROBOT, FAULT_JAM, jammed_ms).await? {
                 break event;
             }
             ensure!(Instant::now() < end, "the server has the error code and no event of it");

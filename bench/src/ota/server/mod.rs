@@ -34,15 +34,15 @@ pub async fn run(args: &OtaArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figur
         (Vec::new(), Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for _ in 0..args.rounds {
         if robots > 0 {
-            hear.push(told(assign::measure(args, robots, assign::Robots::Hear).await?, say));
-            take.push(told(assign::measure(args, robots, assign::Robots::Take).await?, say));
+            hear.push(report_run(assign::measure(args, robots, assign::Robots::Hear).await?, say));
+            take.push(report_run(assign::measure(args, robots, assign::Robots::Take).await?, say));
             match cut::measure(args, robots).await? {
-                Some(cut) => cuts.push(told(cut, say)),
+                Some(cut) => cuts.push(report_run(cut, say)),
                 None => say("every robot was assigned before the server could be killed: nothing is told of it"),
             }
         }
         if args.server.back_robots > 0 {
-            ways.push(told(back::measure(args).await?, say));
+            ways.push(report_run(back::measure(args).await?, say));
         }
         let dir = place(args.dir.as_ref())?;
         syncs_ms.push(median(&Disk::beside(dir.path())?.appends_ms(APPENDS)?));
@@ -55,7 +55,7 @@ pub async fn run(args: &OtaArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figur
     Ok(figures)
 }
 
-/// Says what one run came to: all of them together take minutes.
+/// Reports the result of one run: all of them together take minutes.
 fn told<T: std::fmt::Debug>(run: T, say: &dyn Fn(&str)) -> T {
     say(&format!("{run:?}"));
     run
