@@ -45,7 +45,7 @@ pub fn prepare(process: &Process) -> Result<()> {
     let mut init = Command::new(process.program.with_file_name("initdb"));
     init.args(["-A", "scram-sha-256", "-E", "UTF8", "--locale=C.UTF-8", "-U", user, "-D"]).arg(&data);
     init.arg("--pwfile").arg(&secret);
-    let made = said(as_user(init.current_dir(folder)));
+    let made = run_quietly(as_user(init.current_dir(folder)));
     std::fs::remove_file(&secret).context("removing the password")?;
     made?;
     // A server without a door makes the database.
@@ -54,7 +54,7 @@ pub fn prepare(process: &Process) -> Result<()> {
     let script = folder.join("create.sql");
     std::fs::write(&script, format!("CREATE DATABASE \"{database}\"\n")).context("writing a statement")?;
     single.stdin(std::fs::File::open(&script).context("reading a statement")?);
-    said(as_user(&mut single))?;
+    run_quietly(as_user(&mut single))?;
     std::fs::remove_file(&script).context("removing a statement")
 }
 
@@ -69,7 +69,7 @@ fn give_keys(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-fn said(command: &mut Command) -> Result<()> {
+fn run_quietly(command: &mut Command) -> Result<()> {
     let output = command.output().with_context(|| format!("running {command:?}"))?;
     ensure!(output.status.success(), "{command:?}: {}", String::from_utf8_lossy(&output.stderr).trim());
     Ok(())
