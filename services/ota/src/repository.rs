@@ -3,19 +3,19 @@
 //! Invariant: a publication is checked as a robot would check it before anything of it is written; the timestamp is written last, and what
 //! is shown is what it leads to, so that a cut at any write leaves the older or the newer repository whole. Versions never go back.
 
+mod cannot_sign;
 mod check;
 mod documents;
 mod error;
 mod files;
-mod keyless;
 mod newest;
 mod online;
 
+pub use cannot_sign::{CannotSign, SetLost};
 pub use documents::Documents;
 pub(crate) use documents::every_second;
 pub use error::Error;
 pub use files::raise_floor;
-pub use keyless::{Keyless, SetLost};
 pub use newest::{By, Newest, Release, SignedDocument};
 pub use online::OnlineKeys;
 
@@ -74,7 +74,7 @@ pub struct Repository {
     /// Says whether its wall may be signed by. None: times are given by whoever asks, and hold.
     clock: Option<Arc<dyn Clock>>,
     /// What was said last of why no order may be signed.
-    told: Mutex<Option<Keyless>>,
+    told: Mutex<Option<CannotSign>>,
     /// One publication or signature at a time. Held to the end of its writes, whoever still waits for them.
     writing: Gate,
     /// Lowest version of a snapshot or timestamp that is signed.
@@ -143,9 +143,9 @@ impl Repository {
     ///
     /// # Errors
     /// Robots take no orders of any key that is here, or the wall is in doubt; so none may be signed.
-    pub fn directive_key(&self) -> Result<Arc<SecretKey>, Keyless> {
+    pub fn directive_key(&self) -> Result<Arc<SecretKey>, CannotSign> {
         match self.doubt() {
-            Some(_) => Err(Keyless::Clock),
+            Some(_) => Err(CannotSign::Clock),
             None => self.keys.directive(self.newest().as_deref()),
         }
     }
@@ -155,7 +155,7 @@ impl Repository {
     ///
     /// # Errors
     /// As there.
-    pub async fn find_directive_key(&self) -> Result<Arc<SecretKey>, Keyless> {
+    pub async fn find_directive_key(&self) -> Result<Arc<SecretKey>, CannotSign> {
         let mut found = self.directive_key();
         if found.is_err() {
             let keys = self.keys.clone();

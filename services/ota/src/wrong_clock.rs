@@ -4,7 +4,7 @@ use crate::content::Room;
 use crate::fixture::{SEEDS, START, files, release, robot, targets, write_keys};
 use crate::folder::Owner;
 use crate::opened::Opened;
-use crate::repository::{Act, Error, FRESHEN_AFTER_MS, Keyless};
+use crate::repository::{Act, CannotSign, Error, FRESHEN_AFTER_MS};
 use crate::{OtaService, Parts};
 use midshift_bundle::trust::{self, Reading, Source, Trusted};
 use midshift_core::time::{Clock, Utc};
@@ -113,7 +113,7 @@ async fn a_wall_that_was_thirty_days_ahead_for_a_minute_stops_no_update_afterwar
     assert_eq!(site.version(), 1, "it was due by that wall, and nothing was signed");
     let error = site.publish(&first, "1.1.0", 1).await.expect_err("nor is a release");
     assert!(matches!(error, Error::Clock(doubt) if doubt.step_ms == MONTH_MS), "{error}");
-    assert_eq!(site.opened().repository.directive_key().err(), Some(Keyless::Clock));
+    assert_eq!(site.opened().repository.directive_key().err(), Some(CannotSign::Clock));
     let naive = robots[1].raise_time_floor(site.opened().now()).expect("one that goes by any echo");
     site.pass(MINUTE_MS).await;
     let later = START.plus_ms(MINUTE_MS);

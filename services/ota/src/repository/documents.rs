@@ -7,10 +7,10 @@
 //! 3. A file that the disk fails to give is not gone. What was known of it stays, and it is tried again once a second,
 //!    whenever the folder is followed; a request never tries it.
 
+use super::cannot_sign::SetLost;
 use super::check;
 use super::error::Error;
 use super::files::{TIMESTAMP, file, read, read_by, read_seen};
-use super::keyless::SetLost;
 use super::newest::{By, Newest, Release, SignedDocument};
 use crate::content::Content;
 use crate::threads::blocking;

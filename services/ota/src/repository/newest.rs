@@ -1,6 +1,6 @@
 //! What the repository says: its newest documents, the bundles that they list, and who published them.
 
-use super::keyless::SetLost;
+use super::cannot_sign::SetLost;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::freshness::{Edition, Stamp};
 use midshift_bundle::key_set::KeySet;

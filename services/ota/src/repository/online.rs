@@ -2,8 +2,8 @@
 //!
 //! Invariant: only a key that the newest root, or the newest set of directive keys, names signs anything.
 
+use super::cannot_sign::CannotSign;
 use super::error::{Error, io};
-use super::keyless::Keyless;
 use super::newest::{Newest, SignedDocument};
 use midshift_bundle::freshness::{self, OnlineRole, check_online};
 use midshift_bundle::key_set::KeySet;
@@ -38,11 +38,11 @@ impl OnlineKeys {
     ///
     /// # Errors
     /// Robots take no orders of any key that is here.
-    pub(super) fn directive(&self, newest: Option<&Newest>) -> Result<Arc<SecretKey>, Keyless> {
+    pub(super) fn directive(&self, newest: Option<&Newest>) -> Result<Arc<SecretKey>, CannotSign> {
         match newest.and_then(|newest| newest.key_set.as_ref()) {
-            Some(set) => self.named_by(set).ok_or(Keyless::Ended { number: set.number }),
+            Some(set) => self.named_by(set).ok_or(CannotSign::Ended { number: set.number }),
             None if newest.is_some_and(Newest::lists_sets) => {
-                Err(newest.and_then(|newest| newest.set_lost).map_or(Keyless::Unknown, Keyless::Lost))
+                Err(newest.and_then(|newest| newest.set_lost).map_or(CannotSign::Unknown, CannotSign::Lost))
             }
             // Read: every role has one.
             None => Ok(self.directives()[0].clone()),

@@ -2,7 +2,7 @@
 
 use super::{fields, published};
 use crate::fixture::{Room, SEEDS, START, first_root, give_back, hide, key, key_set, targets};
-use crate::repository::{Act, Documents, Error, FRESHEN_AFTER_MS, Keyless, SetLost};
+use crate::repository::{Act, CannotSign, Documents, Error, FRESHEN_AFTER_MS, SetLost};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::repository::{PEOPLE_LIFE_MS, sign_targets};
 use midshift_core::reason::Code;
@@ -88,8 +88,8 @@ async fn a_server_without_a_key_of_the_newest_set_signs_nothing_until_the_key_is
     let file = room.dir.path().join("keys/directive-2.pem");
     fs::remove_file(&file).expect("it was not given to this process");
     let room = room.restarted().await;
-    assert_eq!(room.repository.find_directive_key().await.err(), Some(Keyless::Ended { number: 1 }));
-    let reason = Keyless::Ended { number: 1 }.reason();
+    assert_eq!(room.repository.find_directive_key().await.err(), Some(CannotSign::Ended { number: 1 }));
+    let reason = CannotSign::Ended { number: 1 }.reason();
     assert_eq!((reason.code, reason.metadata["set"].as_str()), (Code::NoDirectiveKey, "1"));
     key(15).write(&file).expect("a key");
     assert!(room.repository.directive_key().is_err(), "nobody has looked");
@@ -105,7 +105,7 @@ async fn a_server_that_cannot_read_the_newest_set_signs_nothing_until_it_can() {
     push(&room, &first, 1, &[set]).await.expect("published");
     hide(&path);
     let room = room.restarted().await;
-    assert_eq!(room.repository.find_directive_key().await.err(), Some(Keyless::Unknown), "5 may have ended");
+    assert_eq!(room.repository.find_directive_key().await.err(), Some(CannotSign::Unknown), "5 may have ended");
     give_back(&path);
     room.repository.documents().follow().await.expect("readable");
     assert_eq!(signs_with(&room), 15);
@@ -120,7 +120,7 @@ async fn after_all_keys_of_a_set_were_lost_the_server_signs_nothing_until_a_set_
     }
     key(25).write(&room.dir.path().join("keys/directive-3.pem")).expect("a key");
     let room = room.restarted().await;
-    assert_eq!(room.repository.directive_key().err(), Some(Keyless::Ended { number: 1 }));
+    assert_eq!(room.repository.directive_key().err(), Some(CannotSign::Ended { number: 1 }));
     push(&room, &second, 2, &[key_set(2, &[25], 25)]).await.expect("robots have it from their trust files");
     assert_eq!(signs_with(&room), 25);
     assert_eq!(room.repository.newest().expect("there").key_set.as_ref().map(|set| set.number), Some(2));
@@ -138,7 +138,7 @@ async fn a_server_whose_newest_set_is_gone_or_damaged_says_which_and_signs_again
             Some(bytes) => fs::write(&path, bytes).expect("spoiled"),
         }
         let room = room.restarted().await;
-        let lost = Keyless::Lost(SetLost { number: 1 });
+        let lost = CannotSign::Lost(SetLost { number: 1 });
         assert_eq!(room.repository.find_directive_key().await.err(), Some(lost), "5 may have ended");
         let reason = lost.reason();
         assert_eq!((reason.code, reason.metadata["file"].as_str()), (Code::NoDirectiveKey, "gone or damaged"));

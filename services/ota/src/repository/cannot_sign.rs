@@ -1,10 +1,10 @@
-//! Why this process may sign no order to robots, and what a person does about it.
+//! Says why this process cannot sign directives to robots, and what a person does about it.
 
 use midshift_core::reason::{Code, Reason};
 
-/// Why no order to robots may be signed: they would refuse it.
+/// Why this process cannot sign a directive that robots would accept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Keyless {
+pub enum CannotSign {
     /// The newest set of directive keys names none that is here.
     Ended {
         /// The set's.
@@ -25,7 +25,7 @@ pub struct SetLost {
     pub number: u64,
 }
 
-impl Keyless {
+impl CannotSign {
     /// For people.
     pub fn reason(self) -> Reason {
         match self {
