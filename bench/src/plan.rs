@@ -3,7 +3,7 @@
 
 use crate::figure::{Figure, percentile};
 use crate::old_store::{self, OldArgs};
-use midshift_core::fleet::projection::{FleetProjection, Rowed};
+use midshift_core::fleet::projection::{FleetProjection, RevisedRow};
 use midshift_core::fleet::{Board, Pace, Plan, Slice, cycle, found};
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::{Inventory, ReportedState, Vitals};
@@ -183,7 +183,7 @@ fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (
         let inventory =
             Inventory { capabilities: vec!["pick".into(), "place".into()], payload_g: 10_000, ..Inventory::default() };
         let session = Session::new(robot_id.clone(), 1, inventory);
-        view.sessions.insert(session.id(), Rowed { revision: Revision(1), row: session });
+        view.sessions.insert(session.id(), RevisedRow { revision: Revision(1), row: session });
         let waypoint = Some(site.waypoints()[draw(cells)].waypoint_id.clone());
         let vitals = Vitals { waypoint, battery_permille, ..Vitals::default() };
         let live = Live {

@@ -4,7 +4,7 @@
 //! neither stands without the other. What is answered to the second is that, and how things are by then.
 
 use crate::privacy;
-use crate::projection::{Projected, Projection, Slot, Tx};
+use crate::projection::{Projected, Projection, RowMap, Tx};
 use crate::reason::{Code, Kind, Reason, Refusal};
 use crate::rows::{Index, Record, Revision, Table, body_is_json};
 use crate::time::Utc;
@@ -50,7 +50,7 @@ impl<C: IdempotentRequest> Record for CommandKey<C> {
 /// # Errors
 /// The request_id was used for something else.
 pub fn done_before<C: IdempotentRequest>(
-    known: &Slot<CommandKey<C>>,
+    known: &RowMap<CommandKey<C>>,
     request_id: &str,
     command: &C,
     seen: Option<Revision>,
@@ -70,7 +70,7 @@ pub fn done_before<C: IdempotentRequest>(
 /// # Errors
 /// The request_id was used for something else.
 pub fn is_repeat<C: IdempotentRequest>(
-    known: &Slot<CommandKey<C>>,
+    known: &RowMap<CommandKey<C>>,
     request_id: &str,
     command: &C,
     seen: Option<Revision>,
@@ -89,7 +89,7 @@ pub fn remember<P: Projection, C: IdempotentRequest>(
 {
     let at_unix_ms = tx.now.wall.0;
     let oldest_ms = privacy::retention_of(C::KEYS).before(tx.now.steady_wall()).map_or(i64::MIN, |before| before.0);
-    let known = CommandKey::<C>::slot(tx.view).values();
+    let known = CommandKey::<C>::rows(tx.view).values();
     let past = known.filter(|k| k.row.at_unix_ms < oldest_ms).take(FORGOTTEN_AT_ONCE);
     let past: Vec<String> = past.map(|k| k.row.id.clone()).collect();
     past.iter().for_each(|id| tx.delete::<CommandKey<C>>(id, "command.forgotten"));

@@ -15,9 +15,9 @@ use crate::time::Now;
 use crate::unknown_rows::UnknownRows;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// A row with its revision.
+/// A row of a projection, with its revision.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Rowed<R> {
+pub struct RevisedRow<R> {
     /// Writes so far.
     pub revision: Revision,
     /// The row.
@@ -25,9 +25,9 @@ pub struct Rowed<R> {
 }
 
 /// Rows of one table by id.
-pub type Slot<R> = BTreeMap<String, Rowed<R>>;
+pub type RowMap<R> = BTreeMap<String, RevisedRow<R>>;
 
-/// What one service knows of the rows.
+/// A projection: what one service knows of the rows.
 pub trait Projection: 'static {
     /// Who decides on it.
     const WRITER: Writer;
@@ -37,14 +37,14 @@ pub trait Projection: 'static {
 
 /// A record that a projection keeps.
 pub trait Projected<P: Projection>: Record {
-    /// The slot of the projection that keeps it.
-    fn slot(projection: &mut P) -> &mut Slot<Self>;
-    /// What else changes with it: indices and what must be looked at again. Called after the slot changed.
+    /// The rows of this record in the projection.
+    fn rows(projection: &mut P) -> &mut RowMap<Self>;
+    /// What else changes with it: indices and what must be looked at again. Called after the rows changed.
     fn changed(_projection: &mut P, _id: &str, _old: Option<&Self>) {}
 }
 
-/// Takes one row as the store has it; none: deleted. What the projection already has is passed over. A row with a value
-/// that this build does not know is kept aside.
+/// Applies one row of the store to the projection; none: the row is deleted. An older revision is passed over. A row with
+/// a value that this build does not know is kept aside.
 ///
 /// # Errors
 /// A body that is damaged.
@@ -55,19 +55,19 @@ pub fn apply_row<P: Projection, R: Projected<P>>(
     row: Option<&Row>,
 ) -> Result<(), BadRow> {
     let key = Key::new(R::TABLE, id);
-    let is_known = R::slot(projection).get(id).is_some_and(|known| known.revision >= revision);
+    let is_known = R::rows(projection).get(id).is_some_and(|known| known.revision >= revision);
     if is_known || projection.unknown_rows().has(&key, revision) {
         return Ok(());
     }
     projection.unknown_rows().forget(&key);
     let old = match row.map(|row| (row, row.decode())) {
-        Some((_, Ok(row))) => R::slot(projection).insert(id.to_owned(), Rowed { revision, row }),
+        Some((_, Ok(row))) => R::rows(projection).insert(id.to_owned(), RevisedRow { revision, row }),
         Some((row, Err(error))) if error.is_unknown() => {
             projection.unknown_rows().keep_aside(row, &error);
-            R::slot(projection).remove(id)
+            R::rows(projection).remove(id)
         }
         Some((_, Err(error))) => return Err(error),
-        None => R::slot(projection).remove(id),
+        None => R::rows(projection).remove(id),
     };
     R::changed(projection, id, old.as_ref().map(|r| &r.row));
     Ok(())
@@ -97,22 +97,22 @@ pub fn kind_of(item: &Item) -> &'static str {
     item.rows.first().map_or("", |row| row.kind)
 }
 
-/// What a decision was to change: its kind, and its rows but for marks, clocks and incidents, which are others each
-/// time.
+/// Identifies a decision by its kind and the keys of its rows. Marks, clocks and incidents do not count: they are others
+/// each time.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Outline {
+pub struct DecisionKey {
     /// What happens to its first row.
     pub kind: &'static str,
     /// Its rows, in order.
     pub keys: Vec<Key>,
 }
 
-impl Outline {
-    /// That of an item.
+impl DecisionKey {
+    /// The key of the decision that an item carries out.
     pub fn from_item(item: &Item) -> Self {
         Self::new(kind_of(item), item.rows.iter().map(|row| &row.key))
     }
-    /// That of a decision of this kind on these rows.
+    /// The key of a decision of this kind on these rows.
     pub fn new<'a>(kind: &'static str, keys: impl Iterator<Item = &'a Key>) -> Self {
         let is_fixed = |key: &&Key| !matches!(key.table, Table::FleetMark | Table::ServiceClock | Table::Incident);
         let mut keys: Vec<Key> = keys.filter(is_fixed).cloned().collect();
@@ -122,10 +122,10 @@ impl Outline {
 }
 
 /// Puts a row of a projection back to what it was.
-fn put_back<P: Projection, R: Projected<P>>(projection: &mut P, id: &str, old: Option<Rowed<R>>) {
+fn put_back<P: Projection, R: Projected<P>>(projection: &mut P, id: &str, old: Option<RevisedRow<R>>) {
     let was = match old {
-        Some(old) => R::slot(projection).insert(id.to_owned(), old),
-        None => R::slot(projection).remove(id),
+        Some(old) => R::rows(projection).insert(id.to_owned(), old),
+        None => R::rows(projection).remove(id),
     };
     R::changed(projection, id, was.as_ref().map(|r| &r.row));
 }
@@ -162,13 +162,13 @@ impl<'a, P: Projection> Tx<'a, P> {
     /// Creates or changes a row.
     pub fn put_row<R: Projected<P>>(&mut self, record: R, kind: &'static str) {
         let key = record.key();
-        let known = R::slot(self.view).get(&*key.id).map_or(Revision(0), |r| r.revision);
+        let known = R::rows(self.view).get(&*key.id).map_or(Revision(0), |r| r.revision);
         let write = Write::Put { index: record.index(), body: record.body() };
         let revision = match self.note(key.clone(), known, write, kind) {
             Expect::Absent => Revision(1),
             Expect::At(known) => known.next(),
         };
-        let old = R::slot(self.view).insert(key.id.to_string(), Rowed { revision, row: record });
+        let old = R::rows(self.view).insert(key.id.to_string(), RevisedRow { revision, row: record });
         R::changed(self.view, &key.id, old.as_ref().map(|r| &r.row));
         self.undo.push(Box::new(move |view| put_back::<P, R>(view, &key.id, old)));
     }
@@ -178,7 +178,7 @@ impl<'a, P: Projection> Tx<'a, P> {
         if self.at.contains_key(&key) {
             return;
         }
-        let known = R::slot(self.view).get(id).map(|r| r.revision);
+        let known = R::rows(self.view).get(id).map(|r| r.revision);
         self.at.insert(key.clone(), self.item.rows.len());
         self.item.keep_row(key, known.map_or(Expect::Absent, Expect::At));
     }
@@ -197,7 +197,7 @@ impl<'a, P: Projection> Tx<'a, P> {
     }
     /// Deletes a row, if there is one.
     pub fn delete<R: Projected<P>>(&mut self, id: &str, kind: &'static str) {
-        let Some(old) = R::slot(self.view).remove(id) else { return };
+        let Some(old) = R::rows(self.view).remove(id) else { return };
         self.note(Key::new(R::TABLE, id), old.revision, Write::Delete, kind);
         R::changed(self.view, id, Some(&old.row));
         let id = id.to_owned();
@@ -219,9 +219,9 @@ impl<'a, P: Projection> Tx<'a, P> {
         self.item.rows.push(RowChange { key, expect, write, kind });
         expect
     }
-    /// What it is about.
-    pub fn outline(&self) -> Outline {
-        Outline::from_item(&self.item)
+    /// The key of this decision.
+    pub fn decision_key(&self) -> DecisionKey {
+        DecisionKey::from_item(&self.item)
     }
     /// Why it is not decided: it touches a row that is kept aside.
     pub fn unknown_row(&mut self) -> Option<Reason> {
@@ -275,8 +275,8 @@ macro_rules! projection {
     ) => {
         $(#[$about])*
         pub struct $name {
-            $($(#[$whole_doc])* pub $whole: $crate::projection::Slot<$whole_record>,)*
-            $($(#[$part_doc])* pub $part: $crate::projection::Slot<$part_record>,)*
+            $($(#[$whole_doc])* pub $whole: $crate::projection::RowMap<$whole_record>,)*
+            $($(#[$part_doc])* pub $part: $crate::projection::RowMap<$part_record>,)*
             $($(#[$kept_doc])* pub $kept: $kept_type,)*
             $($(#[$anew_doc])* pub $anew: $anew_type,)*
         }
@@ -288,8 +288,8 @@ macro_rules! projection {
             /// An empty projection of the site. `started`: when the service began; `read`: when its rows are read.
             pub fn new($($arg: $arg_type),*) -> Self {
                 Self {
-                    $($whole: $crate::projection::Slot::new(),)*
-                    $($part: $crate::projection::Slot::new(),)*
+                    $($whole: $crate::projection::RowMap::new(),)*
+                    $($part: $crate::projection::RowMap::new(),)*
                     $($kept: $kept_begin,)*
                     $($anew: $anew_begin,)*
                 }
@@ -343,10 +343,10 @@ pub(crate) use projection;
 
 /// Says which field of a projection keeps a record, and whether something is derived from it.
 macro_rules! viewed {
-    ($name:ident $slot:ident $record:ident $($index:ident)?) => {
+    ($name:ident $rows:ident $record:ident $($index:ident)?) => {
         impl $crate::projection::Projected<$name> for $record {
-            fn slot(projection: &mut $name) -> &mut $crate::projection::Slot<Self> {
-                &mut projection.$slot
+            fn rows(projection: &mut $name) -> &mut $crate::projection::RowMap<Self> {
+                &mut projection.$rows
             }
             $(fn changed(projection: &mut $name, id: &str, old: Option<&Self>) {
                 <$name as $index<Self>>::changed(projection, id, old);

@@ -10,7 +10,7 @@ use crate::requests::{PendingCommand, Request};
 use midshift_core::fleet::projection::named;
 use midshift_core::fleet::{Plan, obeyed, put_right, refusals};
 use midshift_core::limits;
-use midshift_core::projection::{self, Outline};
+use midshift_core::projection::{self, DecisionKey};
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Item, Key, Row, Seq, Table};
 use midshift_core::time::Now;
@@ -117,7 +117,7 @@ impl Loop {
             tracing::error!(seq = seq.0, sent.kind, "an entry of the log cannot be obeyed and is passed over");
             self.view.unusable.insert(seq);
         } else {
-            refusals::undone(&mut self.view, Outline::new(sent.kind, sent.keys.iter()));
+            refusals::undone(&mut self.view, DecisionKey::new(sent.kind, sent.keys.iter()));
         }
     }
 

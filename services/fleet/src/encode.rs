@@ -19,8 +19,8 @@ use midshift_proto::fleet::v1;
 
 /// What people and the breaker decided about a robot, and what it is taken by.
 pub fn control(view: &FleetProjection, board: &Board, robot_id: &RobotId) -> v1::RobotControl {
-    let rowed = view.control.get(robot_id.as_str());
-    let row = rowed.map_or_else(|| RobotControl::new(robot_id.clone()), |c| c.row.clone());
+    let revised = view.control.get(robot_id.as_str());
+    let row = revised.map_or_else(|| RobotControl::new(robot_id.clone()), |c| c.row.clone());
     let holder = match view.authority.get(robot_id.as_str()).map(|a| &a.row.holder) {
         Some(RobotHolder::Attempt(id)) => id.to_string(),
         Some(RobotHolder::Maintenance(id)) => format!("maintenance:{id}"),
@@ -57,7 +57,7 @@ pub fn control(view: &FleetProjection, board: &Board, robot_id: &RobotId) -> v1:
             is_forget_pending: word.is_forget_pending,
         }),
         labels: row.labels,
-        etag: etag(rowed.map_or(Revision(0), |c| c.revision)),
+        etag: etag(revised.map_or(Revision(0), |c| c.revision)),
         drain: drain(view, robot_id),
         work_generation: view.desired_work.get(robot_id.as_str()).map_or(0, |d| d.row.generation),
     }

@@ -50,7 +50,7 @@ impl Plan {
             tx.take_back();
             return false;
         }
-        let is_aside = tx.view.refused.keeps_any() && tx.view.refused.is_aside(&tx.outline());
+        let is_aside = tx.view.refused.keeps_any() && tx.view.refused.is_aside(&tx.decision_key());
         if !is_aside && !tx.is_too_large() {
             let item = tx.finish();
             self.slice.decide(usize::from(item.is_some()));
@@ -58,10 +58,10 @@ impl Plan {
             return true;
         }
         self.slice.decide(1);
-        let outline = tx.outline();
+        let decision_key = tx.decision_key();
         let view = tx.take_back();
         if !is_aside {
-            refusals::note_refusal(view, outline);
+            refusals::note_refusal(view, decision_key);
         }
         false
     }

@@ -6,21 +6,21 @@
 
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::RobotId;
-use crate::projection::Outline;
+use crate::projection::DecisionKey;
 use crate::rows::{Key, Table};
 use std::collections::BTreeSet;
 
 /// Notes that the store refused a decision for good, or would; the second time puts it aside.
-pub fn note_refusal(view: &mut FleetProjection, outline: Outline) {
-    let robots = robots_of(view, &outline);
-    view.refused.note(outline, robots);
+pub fn note_refusal(view: &mut FleetProjection, decision_key: DecisionKey) {
+    let robots = robots_of(view, &decision_key);
+    view.refused.note(decision_key, robots);
 }
 
 /// The store refused a decision for good: it is noted, and what it was about is looked at again.
-pub fn undone(view: &mut FleetProjection, outline: Outline) {
-    let robots = robots_of(view, &outline);
+pub fn undone(view: &mut FleetProjection, decision_key: DecisionKey) {
+    let robots = robots_of(view, &decision_key);
     view.refused.look_again(robots);
-    note_refusal(view, outline);
+    note_refusal(view, decision_key);
 }
 
 /// Looks again at robots of decisions that were undone, or are not aside any more.
@@ -32,7 +32,7 @@ pub(in crate::fleet) fn try_again(view: &mut FleetProjection) {
 }
 
 /// Robots that rows are about.
-fn robots_of(view: &FleetProjection, outline: &Outline) -> BTreeSet<RobotId> {
+fn robots_of(view: &FleetProjection, decision_key: &DecisionKey) -> BTreeSet<RobotId> {
     let robot = |key: &Key| match key.table {
         Table::RobotAuthority | Table::RobotControl | Table::DesiredWork | Table::DesiredPolicy => {
             RobotId::parse(&key.id).ok()
@@ -41,7 +41,7 @@ fn robots_of(view: &FleetProjection, outline: &Outline) -> BTreeSet<RobotId> {
         Table::Attempt => view.attempts.get(&*key.id).map(|a| a.row.robot_id.clone()),
         _ => None,
     };
-    outline.keys.iter().filter_map(robot).collect()
+    decision_key.keys.iter().filter_map(robot).collect()
 }
 
 #[cfg(test)]
@@ -104,7 +104,10 @@ mod tests {
     fn what_robots_can_make_it_forget_is_bounded() {
         let mut view = view();
         for n in 0..2 * limits::REFUSED_REMEMBERED {
-            note_refusal(&mut view, Outline { kind: "tests", keys: vec![Key::new(Table::Incident, n.to_string())] });
+            note_refusal(
+                &mut view,
+                DecisionKey { kind: "tests", keys: vec![Key::new(Table::Incident, n.to_string())] },
+            );
         }
         assert_eq!(view.refused.count(), limits::REFUSED_REMEMBERED);
     }

@@ -16,6 +16,6 @@ pub mod refused;
 pub mod rows;
 pub mod state;
 
-pub use crate::projection::{Rowed, Slot};
+pub use crate::projection::{RevisedRow, RowMap};
 pub use loading::{alive, named};
 pub use state::FleetProjection;

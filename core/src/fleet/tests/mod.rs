@@ -14,7 +14,7 @@ mod opened;
 mod order;
 mod unexplained;
 
-use super::projection::{FleetProjection, Rowed};
+use super::projection::{FleetProjection, RevisedRow};
 use super::{Board, Pace, Plan, cycle};
 use crate::ids::{AttemptId, RobotId, TaskId, WaypointId};
 use crate::reason::Reason;
@@ -59,7 +59,7 @@ impl Rig {
         let inventory =
             Inventory { capabilities: vec!["pick".into(), "place".into()], payload_g: 10_000, ..Inventory::default() };
         let session = Session::new(robot_id.clone(), 1, inventory);
-        self.view.sessions.insert(session.id(), Rowed { revision: Revision(1), row: session });
+        self.view.sessions.insert(session.id(), RevisedRow { revision: Revision(1), row: session });
         let vitals = Vitals { waypoint: WaypointId::parse(waypoint).ok(), battery_permille: 900, ..Vitals::default() };
         let live = Live {
             robot_id: robot_id.clone(),

@@ -2,7 +2,7 @@
 
 use super::{BEGIN, Rig};
 use crate::fleet::explanation::{standing, unexplained};
-use crate::fleet::projection::Rowed;
+use crate::fleet::projection::RevisedRow;
 use crate::fleet::rows::Cordon;
 use crate::fleet::{Pace, Plan};
 use crate::ids::{RobotId, StopId, TaskId};
@@ -43,7 +43,7 @@ fn a_task_whose_robots_all_have_a_reason_against_them_is_not_counted() {
     let robot_id = RobotId::parse("r1").expect("an id");
     let mut control = rig.view.control["r1"].row.clone();
     control.cordon = Some(Cordon { reason: "a wheel".into(), actor: "me".into(), since: rig.now.utc });
-    rig.view.control.insert("r1".into(), Rowed { revision: Revision(9), row: control });
+    rig.view.control.insert("r1".into(), RevisedRow { revision: Revision(9), row: control });
     assert_eq!(counted(&mut rig, 40), Vec::<String>::new());
     let told = crate::fleet::explain::robot(&rig.view, &rig.board, &rig.now, &robot_id).expect("known").verdict;
     assert!(told.as_ref().is_some_and(standing::is_told), "{told:?}");
@@ -105,7 +105,7 @@ fn what_a_turn_found_of_robots_serves_all_its_explanations_and_none_of_the_next(
     assert_eq!(against(&rig, "T1"), None);
     let mut control = rig.view.control["r1"].row.clone();
     control.cordon = Some(Cordon { reason: "a wheel".into(), actor: "me".into(), since: rig.now.utc });
-    rig.view.control.insert("r1".into(), Rowed { revision: Revision(9), row: control });
+    rig.view.control.insert("r1".into(), RevisedRow { revision: Revision(9), row: control });
     assert_eq!(against(&rig, "T2"), None, "the robot is not looked at again");
     rig.cycle(Pace::Wake);
     assert_eq!(against(&rig, "T2"), Some(Code::RobotCordoned));

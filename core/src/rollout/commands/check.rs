@@ -58,14 +58,14 @@ pub(in crate::rollout) fn check_command(
             has_room(view)
         }
         Command::Do { rollout_id, verb, .. } => {
-            let rowed = view.rollouts.get(rollout_id.as_str());
-            let rowed = rowed.ok_or_else(|| not_found(Code::RolloutNotFound, "rollout_id", rollout_id))?;
-            let current = Revision(rowed.row.version);
+            let revised = view.rollouts.get(rollout_id.as_str());
+            let revised = revised.ok_or_else(|| not_found(Code::RolloutNotFound, "rollout_id", rollout_id))?;
+            let current = Revision(revised.row.version);
             if seen.is_some_and(|seen| seen != current) {
                 let reason = Reason::from(Code::EtagMismatch).with("etag", current.0);
                 return Err(Refusal::new(Kind::Conflict, reason));
             }
-            verb_fits(view, board, &rowed.row, verb)
+            verb_fits(view, board, &revised.row, verb)
         }
         Command::Revoke { bundle, .. } => {
             let known =

@@ -15,5 +15,5 @@ pub mod spec;
 pub mod state;
 pub mod timestamp;
 
-pub use crate::projection::{Rowed, Slot};
+pub use crate::projection::{RevisedRow, RowMap};
 pub use state::RolloutProjection;

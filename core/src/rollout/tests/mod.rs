@@ -49,7 +49,7 @@ use crate::rollout::projection::rows::{
     AreaBundle, Bundle, Outcome, Phase, RobotSoftware, Rollout, RolloutRobot, Step,
 };
 use crate::rollout::projection::spec::{RolloutSpec, Wave};
-use crate::rollout::projection::{RolloutProjection, Slot};
+use crate::rollout::projection::{RolloutProjection, RowMap};
 use crate::rollout::robots::{due, machine};
 use crate::rollout::{absorb, cycle};
 use crate::rows::{Entry, Expect, Item, Key, Log, Record, Revision, Row, Seq, Table, Write};
@@ -522,7 +522,7 @@ impl Rig {
     }
 }
 
-fn same<R: PartialEq + std::fmt::Debug>(kept: &Slot<R>, fresh: &Slot<R>) {
+fn same<R: PartialEq + std::fmt::Debug>(kept: &RowMap<R>, fresh: &RowMap<R>) {
     assert_eq!(kept, fresh, "the projection that was kept, and one built anew");
 }
 

@@ -17,7 +17,7 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::collections::BTreeMap;
 
-/// Every slot as text, a line a row.
+/// All rows as text, a line a row.
 fn slots(view: &FleetProjection) -> BTreeMap<&'static str, Vec<String>> {
     macro_rules! told {
         ($($slot:ident)*) => { BTreeMap::from([$((stringify!($slot), view.$slot.iter().map(|r| format!("{r:?}")).collect())),*]) };

@@ -58,30 +58,33 @@ impl RolloutWatcher {
         id: &RolloutId,
         by: &Caller,
     ) -> Result<(Option<v1::WatchRolloutResponse>, bool), Refusal> {
-        let rowed = view.rollouts.get(id.as_str()).filter(|rowed| objects::sees(by, &rowed.row));
+        let revised = view.rollouts.get(id.as_str()).filter(|revised| objects::sees(by, &revised.row));
         let reason = || Reason::from(Code::RolloutNotFound).with("rollout_id", id);
-        let rowed = rowed.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))?;
+        let revised = revised.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))?;
         let first = self.rollout.is_none();
         let (from, to) = (format!("{id}/"), format!("{id}0"));
         let mut robots = Vec::new();
         for (key, r) in view.robots.range(from..to) {
-            let shown: Shown =
-                (r.revision, verdict::exposure_of(view, &rowed.row, &r.row), encode::progress_permille(board, &r.row));
+            let shown: Shown = (
+                r.revision,
+                verdict::exposure_of(view, &revised.row, &r.row),
+                encode::progress_permille(board, &r.row),
+            );
             let known = self.robots.get(key) == Some(&shown);
             if !known && robots.len() < ROBOTS_MAX {
                 self.robots.insert(key.clone(), shown);
                 if !first || !r.row.step.is_over() {
-                    robots.push(encode::robot(view, board, now, &rowed.row, &r.row));
+                    robots.push(encode::robot(view, board, now, &revised.row, &r.row));
                 }
             }
         }
-        let rollout = encode::rollout(view, now, &rowed.row);
+        let rollout = encode::rollout(view, now, &revised.row);
         let is_new = !robots.is_empty() || !self.has_told(&rollout);
         if is_new {
             self.rollout = Some(rollout.clone());
         }
         let message = v1::WatchRolloutResponse { rollout: Some(rollout), robots };
-        Ok((is_new.then_some(message), rowed.row.phase.is_over()))
+        Ok((is_new.then_some(message), revised.row.phase.is_over()))
     }
 
     /// Whether a watcher knows this already. Time that passes is news only to one that follows it.

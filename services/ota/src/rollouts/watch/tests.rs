@@ -6,7 +6,7 @@ use midshift_core::gates::{FailureEvidence, TaskTally};
 use midshift_core::identity::Caller;
 use midshift_core::ids::{BundleId, RobotId, RolloutId};
 use midshift_core::rollout::Board;
-use midshift_core::rollout::projection::{RolloutProjection, Rowed};
+use midshift_core::rollout::projection::{RevisedRow, RolloutProjection};
 use midshift_core::rollout::rows::{Act, Bundle, Countdown, Moments, Phase, Rollout, RolloutRobot, Step, WayBack};
 use midshift_core::rollout::spec::RolloutSpec;
 use midshift_core::rows::{Record, Revision};
@@ -17,8 +17,8 @@ use midshift_proto::ota::v1;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-fn rowed<R: Record>(row: R) -> (String, Rowed<R>) {
-    (row.id(), Rowed { revision: Revision(1), row })
+fn revised<R: Record>(row: R) -> (String, RevisedRow<R>) {
+    (row.id(), RevisedRow { revision: Revision(1), row })
 }
 
 fn bundle(bundle: BundleId) -> Bundle {
@@ -122,14 +122,14 @@ impl Rig {
         let site = Arc::new(text::parse(DEMO).expect("the demo reads"));
         let mut view = RolloutProjection::new(site, Now::default(), Now::default());
         let bundle_id = BundleId::parse(&"ab".repeat(32)).expect("an id");
-        view.bundles.extend([rowed(bundle(bundle_id.clone()))]);
-        view.rollouts.extend([rowed(soaking(bundle_id))]);
-        view.robots.extend([rowed(on_trial())]);
+        view.bundles.extend([revised(bundle(bundle_id.clone()))]);
+        view.rollouts.extend([revised(soaking(bundle_id))]);
+        view.robots.extend([revised(on_trial())]);
         Self { view, now: Now::default() }
     }
     /// So many tasks have ended well on trial.
     fn ended(&mut self, succeeded: u64) {
-        self.view.counters.extend([rowed(RobotCounter {
+        self.view.counters.extend([revised(RobotCounter {
             robot_id: robot_id(),
             software: "1.5.0".into(),
             succeeded,
