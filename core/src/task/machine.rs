@@ -82,10 +82,10 @@ impl Phase {
     }
 }
 
-/// Where STOPPING leads, once the robot has confirmed.
+/// The phase that follows STOPPING, once the robot has confirmed the stop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Then {
+pub enum AfterStopping {
     /// It ends as CANCELED.
     Canceled,
     /// FAILED, or NEEDS_OPERATOR if it is opened: a person must look where the item is.
@@ -208,7 +208,7 @@ pub struct Standing {
     /// Its attempt is UNCERTAIN.
     pub uncertain: bool,
     /// Where STOPPING leads.
-    pub then: Option<Then>,
+    pub then: Option<AfterStopping>,
 }
 
 /// Facts that choose between the outcomes of one table cell.
@@ -238,9 +238,9 @@ pub struct Facts {
     pub accepted: bool,
 }
 
-/// What becomes of the attempt.
+/// What the table does to the attempt of the task.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Fate {
+pub enum AttemptAction {
     /// It goes on, or there is none.
     Keep,
     /// It is told to stop.
@@ -261,23 +261,23 @@ pub struct Next {
     /// New phase.
     pub phase: Phase,
     /// New `then`.
-    pub then: Option<Then>,
-    /// What becomes of the attempt.
-    pub fate: Fate,
+    pub then: Option<AfterStopping>,
+    /// What is done to the attempt.
+    pub action: AttemptAction,
 }
 
 /// Where a confirmed stop leads.
-fn after_stop(then: Then, facts: &Facts) -> Phase {
+fn after_stop(then: AfterStopping, facts: &Facts) -> Phase {
     match then {
-        Then::Canceled => Phase::Canceled,
-        Then::Failed if facts.opened => Phase::NeedsOperator,
-        Then::Failed => Phase::Failed,
-        Then::Retry if facts.opened || !facts.retries_left => Phase::NeedsOperator,
-        Then::Retry => Phase::RetryWait,
-        Then::Suspended => Phase::Suspended,
-        Then::Requeue => Phase::Queued,
-        Then::Expired => Phase::Expired,
-        Then::NeedsOperator => Phase::NeedsOperator,
+        AfterStopping::Canceled => Phase::Canceled,
+        AfterStopping::Failed if facts.opened => Phase::NeedsOperator,
+        AfterStopping::Failed => Phase::Failed,
+        AfterStopping::Retry if facts.opened || !facts.retries_left => Phase::NeedsOperator,
+        AfterStopping::Retry => Phase::RetryWait,
+        AfterStopping::Suspended => Phase::Suspended,
+        AfterStopping::Requeue => Phase::Queued,
+        AfterStopping::Expired => Phase::Expired,
+        AfterStopping::NeedsOperator => Phase::NeedsOperator,
     }
 }
 
@@ -328,25 +328,25 @@ pub fn next(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
     }
 }
 
-fn go(phase: Phase, fate: Fate) -> Option<Next> {
-    Some(Next { phase, then: None, fate })
+fn go(phase: Phase, action: AttemptAction) -> Option<Next> {
+    Some(Next { phase, then: None, action })
 }
 
-fn stop(then: Then) -> Option<Next> {
-    Some(Next { phase: Phase::Stopping, then: Some(then), fate: Fate::Stop })
+fn stop(then: AfterStopping) -> Option<Next> {
+    Some(Next { phase: Phase::Stopping, then: Some(then), action: AttemptAction::Stop })
 }
 
 fn stay(at: Standing) -> Option<Next> {
-    Some(Next { phase: at.phase, then: at.then, fate: Fate::Keep })
+    Some(Next { phase: at.phase, then: at.then, action: AttemptAction::Keep })
 }
 
 fn waiting(at: Standing, event: Event) -> Option<Next> {
     match (at.phase, event) {
-        (Phase::Queued, Event::PlanOffers) => go(Phase::Assigned, Fate::Keep),
-        (Phase::Queued | Phase::RetryWait, Event::ScheduleToStart) => go(Phase::NeedsOperator, Fate::Keep),
-        (_, Event::Deadline) => go(Phase::Expired, Fate::Keep),
-        (_, Event::Cancel | Event::CancelForce) => go(Phase::Canceled, Fate::Keep),
-        (Phase::Suspended | Phase::RetryWait, Event::RetryDue) => go(Phase::Queued, Fate::Keep),
+        (Phase::Queued, Event::PlanOffers) => go(Phase::Assigned, AttemptAction::Keep),
+        (Phase::Queued | Phase::RetryWait, Event::ScheduleToStart) => go(Phase::NeedsOperator, AttemptAction::Keep),
+        (_, Event::Deadline) => go(Phase::Expired, AttemptAction::Keep),
+        (_, Event::Cancel | Event::CancelForce) => go(Phase::Canceled, AttemptAction::Keep),
+        (Phase::Suspended | Phase::RetryWait, Event::RetryDue) => go(Phase::Queued, AttemptAction::Keep),
         (_, Event::Hold | Event::LastHoldGone) | (Phase::Queued | Phase::RetryWait, Event::Edit) => stay(at),
         _ => None,
     }
@@ -355,58 +355,60 @@ fn waiting(at: Standing, event: Event) -> Option<Next> {
 fn assigned(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
     let work = if facts.held { Phase::Held } else { Phase::Running };
     match event {
-        Event::Accepted | Event::Progress | Event::SeenRunning => go(work, Fate::Keep),
-        Event::Refused if facts.refused_by_all => go(Phase::Failed, Fate::End),
-        Event::Refused if facts.refusals_spent => go(Phase::NeedsOperator, Fate::End),
-        Event::Refused | Event::StopConfirmed => go(Phase::Queued, Fate::End),
-        Event::OfferAckTimeout | Event::Suspend => stop(Then::Requeue),
-        Event::ScheduleToStart => stop(Then::NeedsOperator),
-        Event::Deadline => stop(Then::Expired),
-        Event::Cancel => stop(Then::Canceled),
-        Event::CancelForce => go(Phase::Canceled, Fate::Abandon),
-        Event::Succeeded => go(Phase::Succeeded, Fate::End),
-        Event::FailedRecoverable => go(after_recoverable(facts), Fate::End),
-        Event::FailedFinal => go(after_final(facts), Fate::End),
-        Event::LeaseOver | Event::StepUnknown => Some(Next { fate: Fate::Uncertain, ..stay(at)? }),
+        Event::Accepted | Event::Progress | Event::SeenRunning => go(work, AttemptAction::Keep),
+        Event::Refused if facts.refused_by_all => go(Phase::Failed, AttemptAction::End),
+        Event::Refused if facts.refusals_spent => go(Phase::NeedsOperator, AttemptAction::End),
+        Event::Refused | Event::StopConfirmed => go(Phase::Queued, AttemptAction::End),
+        Event::OfferAckTimeout | Event::Suspend => stop(AfterStopping::Requeue),
+        Event::ScheduleToStart => stop(AfterStopping::NeedsOperator),
+        Event::Deadline => stop(AfterStopping::Expired),
+        Event::Cancel => stop(AfterStopping::Canceled),
+        Event::CancelForce => go(Phase::Canceled, AttemptAction::Abandon),
+        Event::Succeeded => go(Phase::Succeeded, AttemptAction::End),
+        Event::FailedRecoverable => go(after_recoverable(facts), AttemptAction::End),
+        Event::FailedFinal => go(after_final(facts), AttemptAction::End),
+        Event::LeaseOver | Event::StepUnknown => Some(Next { action: AttemptAction::Uncertain, ..stay(at)? }),
         Event::Hold | Event::LastHoldGone => stay(at),
         _ => None,
     }
 }
 
 fn running(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
-    let too_long = if facts.retry_wanted { Then::Retry } else { Then::Failed };
+    let too_long = if facts.retry_wanted { AfterStopping::Retry } else { AfterStopping::Failed };
     match event {
         Event::Accepted | Event::Progress | Event::SeenRunning => stay(at),
-        Event::Hold => go(Phase::Held, Fate::Keep),
-        Event::LastHoldGone if at.phase == Phase::Held => go(Phase::Running, Fate::Keep),
-        Event::Suspend => stop(Then::Suspended),
-        Event::Succeeded => go(Phase::Succeeded, Fate::End),
-        Event::FailedRecoverable => go(after_recoverable(facts), Fate::End),
-        Event::FailedFinal => go(after_final(facts), Fate::End),
-        Event::StopConfirmed => go(after_drop(facts), Fate::End),
+        Event::Hold => go(Phase::Held, AttemptAction::Keep),
+        Event::LastHoldGone if at.phase == Phase::Held => go(Phase::Running, AttemptAction::Keep),
+        Event::Suspend => stop(AfterStopping::Suspended),
+        Event::Succeeded => go(Phase::Succeeded, AttemptAction::End),
+        Event::FailedRecoverable => go(after_recoverable(facts), AttemptAction::End),
+        Event::FailedFinal => go(after_final(facts), AttemptAction::End),
+        Event::StopConfirmed => go(after_drop(facts), AttemptAction::End),
         Event::Stall if at.phase == Phase::Running => stop(too_long),
         Event::StartToClose => stop(too_long),
-        Event::Deadline => stop(Then::Expired),
-        Event::Cancel => stop(Then::Canceled),
-        Event::CancelForce => go(Phase::Canceled, Fate::Abandon),
-        Event::LeaseOver | Event::StepUnknown => Some(Next { fate: Fate::Uncertain, ..stay(at)? }),
+        Event::Deadline => stop(AfterStopping::Expired),
+        Event::Cancel => stop(AfterStopping::Canceled),
+        Event::CancelForce => go(Phase::Canceled, AttemptAction::Abandon),
+        Event::LeaseOver | Event::StepUnknown => Some(Next { action: AttemptAction::Uncertain, ..stay(at)? }),
         _ => None,
     }
 }
 
 fn stopping(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
-    let then = at.then.unwrap_or(Then::NeedsOperator);
+    let then = at.then.unwrap_or(AfterStopping::NeedsOperator);
     match event {
-        Event::Succeeded => go(Phase::Succeeded, Fate::End),
-        Event::Refused | Event::FailedRecoverable | Event::StopConfirmed => go(after_stop(then, facts), Fate::End),
-        Event::FailedFinal if then == Then::Retry => go(after_final(facts), Fate::End),
-        Event::FailedFinal => go(after_stop(then, facts), Fate::End),
-        Event::Cancel => stop(Then::Canceled),
-        Event::Deadline if then != Then::Canceled => stop(Then::Expired),
-        Event::ScheduleToStart if then == Then::Requeue => stop(Then::NeedsOperator),
-        Event::CancelForce => go(Phase::Canceled, Fate::Abandon),
-        Event::StopConfirmTimeout => go(Phase::NeedsOperator, Fate::Abandon),
-        Event::LeaseOver | Event::StepUnknown => Some(Next { fate: Fate::Uncertain, ..stay(at)? }),
+        Event::Succeeded => go(Phase::Succeeded, AttemptAction::End),
+        Event::Refused | Event::FailedRecoverable | Event::StopConfirmed => {
+            go(after_stop(then, facts), AttemptAction::End)
+        }
+        Event::FailedFinal if then == AfterStopping::Retry => go(after_final(facts), AttemptAction::End),
+        Event::FailedFinal => go(after_stop(then, facts), AttemptAction::End),
+        Event::Cancel => stop(AfterStopping::Canceled),
+        Event::Deadline if then != AfterStopping::Canceled => stop(AfterStopping::Expired),
+        Event::ScheduleToStart if then == AfterStopping::Requeue => stop(AfterStopping::NeedsOperator),
+        Event::CancelForce => go(Phase::Canceled, AttemptAction::Abandon),
+        Event::StopConfirmTimeout => go(Phase::NeedsOperator, AttemptAction::Abandon),
+        Event::LeaseOver | Event::StepUnknown => Some(Next { action: AttemptAction::Uncertain, ..stay(at)? }),
         Event::Accepted
         | Event::Progress
         | Event::SeenRunning
@@ -418,35 +420,35 @@ fn stopping(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
 }
 
 fn uncertain(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
-    let wish = |then| Some(Next { phase: at.phase, then: Some(then), fate: Fate::Keep });
-    let known = |phase| Some(Next { phase, then: at.then, fate: Fate::Known });
-    let too_long = if facts.retry_wanted { Then::Retry } else { Then::Failed };
+    let wish = |then| Some(Next { phase: at.phase, then: Some(then), action: AttemptAction::Keep });
+    let known = |phase| Some(Next { phase, then: at.then, action: AttemptAction::Known });
+    let too_long = if facts.retry_wanted { AfterStopping::Retry } else { AfterStopping::Failed };
     match event {
         Event::Accepted | Event::Progress | Event::SeenRunning => match (at.then, facts.held) {
-            (Some(_), _) => Some(Next { phase: Phase::Stopping, then: at.then, fate: Fate::Known }),
+            (Some(_), _) => Some(Next { phase: Phase::Stopping, then: at.then, action: AttemptAction::Known }),
             (None, true) => known(Phase::Held),
             (None, false) => known(Phase::Running),
         },
-        Event::Succeeded => go(Phase::Succeeded, Fate::End),
+        Event::Succeeded => go(Phase::Succeeded, AttemptAction::End),
         Event::FailedRecoverable => {
-            go(at.then.map_or_else(|| after_recoverable(facts), |t| after_stop(t, facts)), Fate::End)
+            go(at.then.map_or_else(|| after_recoverable(facts), |t| after_stop(t, facts)), AttemptAction::End)
         }
         Event::FailedFinal => match at.then {
-            Some(then) if then != Then::Retry => go(after_stop(then, facts), Fate::End),
-            _ => go(after_final(facts), Fate::End),
+            Some(then) if then != AfterStopping::Retry => go(after_stop(then, facts), AttemptAction::End),
+            _ => go(after_final(facts), AttemptAction::End),
         },
         // Refused after it was accepted: the robot lost its memory of it, and with that the work.
         Event::Refused | Event::StopConfirmed => match at.then {
-            Some(then) => go(after_stop(then, facts), Fate::End),
-            None if !facts.accepted => go(Phase::Queued, Fate::End),
-            None => go(after_drop(facts), Fate::End),
+            Some(then) => go(after_stop(then, facts), AttemptAction::End),
+            None if !facts.accepted => go(Phase::Queued, AttemptAction::End),
+            None => go(after_drop(facts), AttemptAction::End),
         },
         Event::StartToClose => wish(at.then.unwrap_or(too_long)),
-        Event::Deadline if at.then != Some(Then::Canceled) => wish(Then::Expired),
-        Event::ScheduleToStart if at.then == Some(Then::Requeue) => wish(Then::NeedsOperator),
-        Event::Cancel => wish(Then::Canceled),
-        Event::CancelForce => go(Phase::Canceled, Fate::Abandon),
-        Event::StepUnknown | Event::UncertainTimeout => go(Phase::NeedsOperator, Fate::Abandon),
+        Event::Deadline if at.then != Some(AfterStopping::Canceled) => wish(AfterStopping::Expired),
+        Event::ScheduleToStart if at.then == Some(AfterStopping::Requeue) => wish(AfterStopping::NeedsOperator),
+        Event::Cancel => wish(AfterStopping::Canceled),
+        Event::CancelForce => go(Phase::Canceled, AttemptAction::Abandon),
+        Event::StepUnknown | Event::UncertainTimeout => go(Phase::NeedsOperator, AttemptAction::Abandon),
         Event::Hold | Event::LastHoldGone | Event::Deadline => stay(at),
         _ => None,
     }
@@ -454,14 +456,14 @@ fn uncertain(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
 
 fn needs_operator(at: Standing, event: Event) -> Option<Next> {
     match event {
-        Event::Succeeded => go(Phase::Succeeded, Fate::End),
-        Event::StopConfirmed => Some(Next { fate: Fate::End, ..stay(at)? }),
+        Event::Succeeded => go(Phase::Succeeded, AttemptAction::End),
+        Event::StopConfirmed => Some(Next { action: AttemptAction::End, ..stay(at)? }),
         // What its robot goes on to say of steps and of opening is kept: a person's answer depends on it.
         Event::Deadline | Event::Progress | Event::SeenRunning | Event::Hold | Event::LastHoldGone => stay(at),
-        Event::Cancel | Event::CancelForce | Event::ResolveCanceled => go(Phase::Canceled, Fate::Keep),
-        Event::ResolveRequeue => go(Phase::Queued, Fate::Keep),
-        Event::ResolveSucceeded => go(Phase::Succeeded, Fate::Keep),
-        Event::ResolveFailed => go(Phase::Failed, Fate::Keep),
+        Event::Cancel | Event::CancelForce | Event::ResolveCanceled => go(Phase::Canceled, AttemptAction::Keep),
+        Event::ResolveRequeue => go(Phase::Queued, AttemptAction::Keep),
+        Event::ResolveSucceeded => go(Phase::Succeeded, AttemptAction::Keep),
+        Event::ResolveFailed => go(Phase::Failed, AttemptAction::Keep),
         _ => None,
     }
 }

@@ -10,7 +10,7 @@ pub mod raw;
 pub mod spec;
 pub mod state;
 
-pub use machine::{Event, Phase, Then};
+pub use machine::{AfterStopping, Event, Phase};
 pub use raw::RawTask;
 pub use spec::TaskSpec;
 pub use state::{Ask, Attempt, AttemptPhase, Resolution, TaskIntake, TaskRequest, TaskState};

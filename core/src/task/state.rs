@@ -1,6 +1,6 @@
 //! The rows of a task: what was asked for, where it is, its attempts, and what people asked afterwards.
 
-use super::machine::{Phase, Then};
+use super::machine::{AfterStopping, Phase};
 use super::spec::TaskSpec;
 use crate::audit::Note;
 use crate::authority::Authority;
@@ -55,7 +55,7 @@ pub struct TaskState {
     /// Why it is there.
     pub reason: Option<Reason>,
     /// Where STOPPING leads once the robot confirmed; kept also while UNCERTAIN.
-    pub then: Option<Then>,
+    pub then: Option<AfterStopping>,
     /// Tokens that hold it; survive every transition.
     pub holds: BTreeSet<String>,
     /// Highest epoch granted; 0: none.
@@ -252,9 +252,9 @@ pub struct Uncertain {
     pub cause: Reason,
 }
 
-/// Where the robot of an attempt was while it had it, as far as its work is done there.
+/// The places that the robot of an attempt visited while it had it, as far as its work is done there.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Been {
+pub struct VisitedPlaces {
     /// The ring in which the robot wrote its events when it was given the attempt: what another one tells is not the whole.
     pub ring: String,
     /// Standing places at which a step is done and that it entered, or stood in already: at most one a step.
@@ -308,7 +308,7 @@ pub struct Attempt {
     pub software: String,
     /// Where the robot was while it had it. None: it is an errand, an older version began it, or a part of it was lost or cannot be compared.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub visited: Option<Been>,
+    pub been: Option<VisitedPlaces>,
 }
 
 impl Attempt {

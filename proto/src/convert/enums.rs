@@ -7,7 +7,7 @@ use midshift_core::rollout::rows::{Ending, Outcome, Pause, Phase as RolloutPhase
 use midshift_core::rollout::spec::{AbortScope, SmallWave, SmallWaveFailure};
 use midshift_core::stop::ladder::Stage;
 use midshift_core::task::state::Errand;
-use midshift_core::task::{AttemptPhase, Phase, Resolution, Then};
+use midshift_core::task::{AfterStopping, AttemptPhase, Phase, Resolution};
 use midshift_core::update::{Goal, UpdateState};
 use midshift_core::work::{Effect, PlaceNews, WorkState};
 
@@ -100,7 +100,7 @@ wire_enums! {
         Queued = Queued, Assigned = Assigned, Running = Running, Held = Held, Suspended = Suspended, Stopping = Stopping,
         RetryWait = RetryWait, NeedsOperator = NeedsOperator, Succeeded = Succeeded, Failed = Failed, Canceled = Canceled, Expired = Expired,
     }
-    Then = task::v1::StopThen {
+    AfterStopping = task::v1::StopThen {
         Canceled = Canceled, Failed = Failed, Retry = Retry, Suspended = Suspended, Requeue = Requeue, Expired = Expired,
         NeedsOperator = NeedsOperator,
     }

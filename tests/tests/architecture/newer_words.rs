@@ -10,7 +10,7 @@ const WORDS: &[(&str, &[&str])] = &[
     (
         "aside",
         &[
-            "Ask",
+            "AfterStopping",
             "AttemptPhase",
             "DrainState",
             "Duty",
@@ -40,7 +40,6 @@ const WORDS: &[(&str, &[&str])] = &[
             "StopLevel",
             "Subject",
             "Suspicion",
-            "Then",
             "TimerKind",
             "UpdateEvent",
             "UpdateState",

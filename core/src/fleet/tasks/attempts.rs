@@ -4,7 +4,7 @@ use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::{RobotAuthority, RobotHolder};
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{AttemptId, RobotId};
-use crate::task::state::{Been, Errand};
+use crate::task::state::{Errand, VisitedPlaces};
 use crate::task::{Attempt, AttemptPhase};
 use crate::time::SiteDuration;
 use crate::work::{Effect, StepKind, WorkStats, WorkStep};
@@ -44,7 +44,7 @@ pub fn fresh_attempt(tx: &Tx, attempt: AttemptId, robot_id: &RobotId, offer: cra
     let session = tx.view.sessions.get(robot_id.as_str()).map(|s| &s.row);
     let software = session.map(|s| s.inventory.software.clone()).unwrap_or_default();
     let of_task = session.filter(|_| attempt.subject.task_id().is_some());
-    let visited = of_task.map(|s| Been { ring: s.ring.clone(), ..Been::default() });
+    let been = of_task.map(|s| VisitedPlaces { ring: s.ring.clone(), ..VisitedPlaces::default() });
     Attempt {
         attempt,
         robot_id: robot_id.clone(),

@@ -13,7 +13,7 @@ use crate::ids::{AttemptId, Subject, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::Presence;
-use crate::task::{Event, Phase, Then};
+use crate::task::{AfterStopping, Event, Phase};
 use crate::time::Now;
 
 /// Timers that are due, and tasks whose deadline passed.
@@ -34,7 +34,7 @@ pub fn due(view: &FleetProjection, now: &Now) -> (Vec<Timer>, Vec<TaskId>) {
 /// Whether the deadline of a task has passed and has not had its effect. In NEEDS_OPERATOR a person decides.
 pub(in crate::fleet) fn is_late(view: &FleetProjection, task_id: &TaskId, now: &Now) -> bool {
     let Some((task, intake)) = view.task(task_id).zip(view.intake(task_id)) else { return false };
-    let ends = task.phase.is_terminal() || matches!(task.then, Some(Then::Expired | Then::Canceled));
+    let ends = task.phase.is_terminal() || matches!(task.then, Some(AfterStopping::Expired | AfterStopping::Canceled));
     let passed = intake.spec.deadline.is_some_and(|deadline| deadline <= now.utc);
     passed && !ends && task.phase != Phase::NeedsOperator
 }
@@ -74,13 +74,13 @@ pub fn fire(tx: &mut Tx, timer: &Timer, board: &Board) {
 /// before UNCERTAIN has lasted too long.
 fn waits_for_silent_robot(tx: &Tx, task_id: &TaskId, attempt: &AttemptId, board: &Board) -> bool {
     let Some(a) = tx.view.attempt(attempt) else { return false };
-    let requeue = tx.view.task(task_id).is_some_and(|t| t.then == Some(Then::Requeue));
+    let requeue = tx.view.task(task_id).is_some_and(|t| t.then == Some(AfterStopping::Requeue));
     requeue && a.accepted.is_none() && liveness::presence(board, &a.robot_id, &tx.now) != Presence::Online
 }
 
 /// A heard robot that was asked to hand its attempt back at a step boundary may take as long as its attempt may last: it ends that itself.
 fn winds_down(tx: &Tx, task_id: &TaskId, attempt: &AttemptId, board: &Board) -> bool {
-    let suspending = tx.view.task(task_id).is_some_and(|t| t.then == Some(Then::Suspended));
+    let suspending = tx.view.task(task_id).is_some_and(|t| t.then == Some(AfterStopping::Suspended));
     let Some(a) = tx.view.attempt(attempt).filter(|a| suspending && a.uncertain.is_none()) else { return false };
     liveness::presence(board, &a.robot_id, &tx.now) == Presence::Online
 }

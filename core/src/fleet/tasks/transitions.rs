@@ -11,9 +11,9 @@ use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::FaultClass;
-use crate::task::machine::{Facts, Fate, Next, Standing, next};
+use crate::task::machine::{AttemptAction, Facts, Next, Standing, next};
 use crate::task::state::Uncertain;
-use crate::task::{Attempt, AttemptPhase, Event, Phase, TaskIntake, TaskState, Then};
+use crate::task::{AfterStopping, Attempt, AttemptPhase, Event, Phase, TaskIntake, TaskState};
 use crate::work::{AttemptReport, Effect, Live, WorkState};
 
 /// What happened to a task, with what is known about it.
@@ -127,30 +127,30 @@ fn move_attempt(tx: &mut Tx, mut a: Attempt, step: Next, news: &News, intake: &T
             a.phase = AttemptPhase::Accepted;
         }
     }
-    match step.fate {
-        Fate::Keep => {}
-        Fate::Stop => stop_attempt(tx, &mut a),
-        Fate::Uncertain => {
+    match step.action {
+        AttemptAction::Keep => {}
+        AttemptAction::Stop => stop_attempt(tx, &mut a),
+        AttemptAction::Uncertain => {
             let unsaid = if news.event == Event::StepUnknown { Code::StepUnknown } else { Code::LeaseOver };
             let cause = news.why.cloned().unwrap_or_else(|| unsaid.into());
             a.uncertain = Some(Uncertain { since: tx.now.utc, cause });
             arm(tx, TimerKind::Uncertain, &a.attempt, limits::UNCERTAIN_LIMIT.as_ms());
         }
-        Fate::Known => {
+        AttemptAction::Known => {
             a.uncertain = None;
             disarm(tx, TimerKind::Uncertain, &a.attempt);
             if step.phase == Phase::Stopping {
                 stop_attempt(tx, &mut a);
             }
         }
-        Fate::End => {
+        AttemptAction::End => {
             let taken = a.accepted.is_some() || a.phase == AttemptPhase::Lost;
             let confirmed = if taken { AttemptPhase::Aborted } else { AttemptPhase::OfferExpired };
             let said = phase_of(news.event, None).filter(|p| *p != AttemptPhase::Refused || a.accepted.is_none());
             a.phase = said.unwrap_or(confirmed);
             end_attempt(tx, &mut a);
         }
-        Fate::Abandon => {
+        AttemptAction::Abandon => {
             a.phase = AttemptPhase::Lost;
             a.uncertain = None;
             a.ended = Some(tx.now.utc);
@@ -308,7 +308,7 @@ fn move_task(tx: &mut Tx, mut t: TaskState, a: Option<&Attempt>, step: Next, new
     if a.is_some_and(|a| a.accepted.is_some()) && t.started.is_none() {
         t.started = Some(tx.now.utc);
     }
-    if step.fate == Fate::End
+    if step.action == AttemptAction::End
         && let Some(a) = a
     {
         t.stats += a.stats;
@@ -505,7 +505,7 @@ pub fn event_of(report: &AttemptReport) -> Event {
 
 /// Where `then` of a finished cancel is shown while the robot still stops.
 pub fn wants_cancel(task: &TaskState) -> bool {
-    task.then == Some(Then::Canceled)
+    task.then == Some(AfterStopping::Canceled)
 }
 
 /// Whether the task may wait for another robot from its next step boundary on: it runs, lets others go first, and is not opened.

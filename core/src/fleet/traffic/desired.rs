@@ -15,8 +15,8 @@ use crate::fleet::tasks::{attempts, claims, load};
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
 use crate::robot::ReportedAttempt;
-use crate::task::{Attempt, AttemptPhase, Then};
-use crate::work::{AreaRules, Assignment, DesiredPolicy, DesiredWork, GrantedPlace, Live, RoutePoint, WorkState};
+use crate::task::{AfterStopping, Attempt, AttemptPhase};
+use crate::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, Live, RoutePoint, WorkState};
 use std::collections::BTreeMap;
 
 /// What a robot may do from this cycle on; `desired` writes it down.
@@ -112,7 +112,7 @@ fn assign(
         Some(old) => old.clone(),
         None => begin(view, a, live)?,
     };
-    work.suspend = stopping && then == Some(Then::Suspended);
+    work.suspend = stopping && then == Some(AfterStopping::Suspended);
     work.stop = stopping && !work.suspend;
     if let Some(release) = releases.0.get(&a.robot_id) {
         if let Some(route) = &release.route {

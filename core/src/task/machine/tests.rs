@@ -6,8 +6,15 @@ use std::collections::{BTreeMap, BTreeSet};
 
 const GOLDEN: &str = include_str!("table.txt");
 
-const THENS: [Then; 7] =
-    [Then::Canceled, Then::Failed, Then::Retry, Then::Suspended, Then::Requeue, Then::Expired, Then::NeedsOperator];
+const THENS: [AfterStopping; 7] = [
+    AfterStopping::Canceled,
+    AfterStopping::Failed,
+    AfterStopping::Retry,
+    AfterStopping::Suspended,
+    AfterStopping::Requeue,
+    AfterStopping::Expired,
+    AfterStopping::NeedsOperator,
+];
 
 /// What a clock does to a task with a live attempt; none of these may free the robot.
 const BY_TIME: [Event; 8] = [
@@ -55,7 +62,7 @@ fn all_facts() -> impl Iterator<Item = Facts> {
 }
 
 fn all_standings() -> impl Iterator<Item = Standing> {
-    let thens: Vec<Option<Then>> = std::iter::once(None).chain(THENS.map(Some)).collect();
+    let thens: Vec<Option<AfterStopping>> = std::iter::once(None).chain(THENS.map(Some)).collect();
     Phase::ALL.into_iter().flat_map(move |phase| {
         let thens = thens.clone();
         [false, true]
@@ -129,13 +136,13 @@ fn shown(at: Standing) -> String {
 /// Where the task and its attempt's certainty stand after `next`, and the fate, in the words of the golden list.
 fn outcome(at: Standing, next: Option<Next>) -> (String, String) {
     let Some(next) = next else { return (".".to_owned(), String::new()) };
-    let uncertain = match next.fate {
-        Fate::Uncertain => true,
-        Fate::Known | Fate::End | Fate::Abandon => false,
-        Fate::Keep | Fate::Stop => at.uncertain && next.phase.has_attempt(),
+    let uncertain = match next.action {
+        AttemptAction::Uncertain => true,
+        AttemptAction::Known | AttemptAction::End | AttemptAction::Abandon => false,
+        AttemptAction::Keep | AttemptAction::Stop => at.uncertain && next.phase.has_attempt(),
     };
     let after = Standing { phase: next.phase, uncertain, then: next.then };
-    (shown(after), format!("{:?}", next.fate).to_lowercase())
+    (shown(after), format!("{:?}", next.action).to_lowercase())
 }
 
 struct Cell {
@@ -144,7 +151,7 @@ struct Cell {
     event: String,
     facts: String,
     next: String,
-    fate: String,
+    action: String,
 }
 
 fn golden() -> Vec<Cell> {
@@ -160,7 +167,7 @@ fn golden() -> Vec<Cell> {
                 event: words[1].clone(),
                 facts: words[2].clone(),
                 next: words[3].clone(),
-                fate: words.get(4).cloned().unwrap_or_default(),
+                action: words.get(4).cloned().unwrap_or_default(),
             }
         })
         .collect()
@@ -172,9 +179,9 @@ fn every_cell_of_the_golden_list_is_what_the_table_says() {
     for cell in golden() {
         let at = standing_named(&cell.state);
         let found = outcome(at, next(at, event_named(&cell.event), &facts_named(&cell.facts)));
-        if found != (cell.next.clone(), cell.fate.clone()) {
+        if found != (cell.next.clone(), cell.action.clone()) {
             let (state, event, facts) = (cell.state, cell.event, cell.facts);
-            wrong.push(format!("{state} {event} {facts}: {found:?}, listed {} {}", cell.next, cell.fate));
+            wrong.push(format!("{state} {event} {facts}: {found:?}, listed {} {}", cell.next, cell.action));
         }
     }
     assert!(wrong.is_empty(), "{wrong:#?}");
@@ -200,7 +207,7 @@ fn what_the_golden_list_does_not_name_is_no_transition() {
             let key = (listed_as(at), snake(&format!("{event:?}")));
             let moves = all_facts().any(|facts| next(at, event, &facts).is_some());
             // A stop ends the wait for a start only if it is there because nobody took the offer.
-            let other_stop = (at.uncertain || at.phase == Phase::Stopping) && at.then != Some(Then::Requeue);
+            let other_stop = (at.uncertain || at.phase == Phase::Stopping) && at.then != Some(AfterStopping::Requeue);
             let named = listed.get(&key).copied().unwrap_or(false);
             let named = named && !(event == Event::ScheduleToStart && other_stop);
             assert_eq!(moves, named, "{} {}", shown(at), key.1);
@@ -228,8 +235,8 @@ fn the_table_answers_every_corner_and_never_with_a_broken_standing() {
                 let Some(next) = answer.filter(|_| reachable.contains(&at)) else { continue };
                 let corner = format!("{} {event:?} {facts:?} -> {next:?}", shown(at));
                 assert!(next.phase != Phase::Stopping || next.then.is_some(), "stops for nothing: {corner}");
-                assert!(next.fate != Fate::Stop || next.phase == Phase::Stopping, "{corner}");
-                let over = matches!(next.fate, Fate::End | Fate::Abandon);
+                assert!(next.action != AttemptAction::Stop || next.phase == Phase::Stopping, "{corner}");
+                let over = matches!(next.action, AttemptAction::End | AttemptAction::Abandon);
                 assert!(!over || !next.phase.has_attempt(), "a live phase without an attempt: {corner}");
                 assert!(!over || next.then.is_none(), "a wish without an attempt: {corner}");
                 if at.phase.has_attempt() && !next.phase.has_attempt() {
@@ -254,8 +261,8 @@ fn no_timeout_frees_an_attempt() {
     for at in reachable().filter(|s| s.phase.has_attempt()) {
         for event in BY_TIME {
             for facts in all_facts() {
-                let fate = next(at, event, &facts).map(|n| n.fate);
-                assert_ne!(fate, Some(Fate::End), "{} {event:?} {facts:?}", shown(at));
+                let action = next(at, event, &facts).map(|n| n.action);
+                assert_ne!(action, Some(AttemptAction::End), "{} {event:?} {facts:?}", shown(at));
             }
         }
     }
@@ -284,7 +291,7 @@ fn a_hold_and_its_end_lose_no_wish() {
             for facts in all_facts() {
                 let Some(after) = next(at, event, &facts) else { continue };
                 assert_eq!(after.then, at.then, "{} {event:?}", shown(at));
-                assert_eq!(after.fate, Fate::Keep, "{} {event:?}", shown(at));
+                assert_eq!(after.action, AttemptAction::Keep, "{} {event:?}", shown(at));
             }
         }
     }
@@ -292,7 +299,7 @@ fn a_hold_and_its_end_lose_no_wish() {
 
 #[test]
 fn a_wish_that_stands_is_answered_whatever_the_robot_reports() {
-    let at = |phase, uncertain| Standing { phase, uncertain, then: Some(Then::Canceled) };
+    let at = |phase, uncertain| Standing { phase, uncertain, then: Some(AfterStopping::Canceled) };
     for phase in [Phase::Running, Phase::Held, Phase::Stopping] {
         for event in [Event::Refused, Event::FailedRecoverable, Event::FailedFinal, Event::StopConfirmed] {
             for facts in all_facts() {
@@ -303,7 +310,8 @@ fn a_wish_that_stands_is_answered_whatever_the_robot_reports() {
         }
         for event in [Event::Accepted, Event::Progress, Event::SeenRunning] {
             let back = next(at(phase, true), event, &NO_FACTS);
-            let stops = Next { phase: Phase::Stopping, then: Some(Then::Canceled), fate: Fate::Known };
+            let stops =
+                Next { phase: Phase::Stopping, then: Some(AfterStopping::Canceled), action: AttemptAction::Known };
             assert_eq!(back, Some(stops), "{event:?}");
         }
     }

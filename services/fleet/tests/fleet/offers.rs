@@ -4,7 +4,7 @@ use crate::harness::{Answer, Seen, World};
 use midshift_core::fleet::rows::HolderState;
 use midshift_core::reason::Code;
 use midshift_core::site::CORRIDOR;
-use midshift_core::task::{AttemptPhase, Phase, Then};
+use midshift_core::task::{AfterStopping, AttemptPhase, Phase};
 
 #[tokio::test(start_paused = true)]
 async fn an_offer_goes_to_the_nearest_eligible_robot_and_is_anchored_to_its_newest_heartbeat() {
@@ -91,7 +91,7 @@ async fn an_unanswered_offer_is_stopped_and_the_robot_freed_only_by_a_heartbeat_
     w.r("r1").hears = false;
     w.submit("T1", "A", "B").await;
     let seen = w.until_phase("T1", Phase::Stopping).await;
-    assert_eq!(seen.task("T1").then, Some(Then::Requeue));
+    assert_eq!(seen.task("T1").then, Some(AfterStopping::Requeue));
     assert!(seen.work("r1").assignment.is_none_or(|a| a.stop));
     w.pass_while(10, "the robot is kept while it has not applied the stop", |s| {
         s.phase("T1") == Phase::Stopping && !s.is_free("r1")
@@ -116,7 +116,7 @@ async fn an_unanswered_offer_to_a_silent_robot_asks_nobody_before_its_lease_is_o
     w.r("r1").cut();
     w.pass_while(29, "nobody is asked", |s| matches!(s.phase("T1"), Phase::Assigned | Phase::Stopping)).await;
     let seen = w.until("nobody knows", |s| s.is_uncertain("T1")).await;
-    assert_eq!((seen.phase("T1"), seen.task("T1").then), (Phase::Stopping, Some(Then::Requeue)));
+    assert_eq!((seen.phase("T1"), seen.task("T1").then), (Phase::Stopping, Some(AfterStopping::Requeue)));
     assert!(!seen.is_free("r1"));
     w.pass_while(240, "nobody is asked yet", |s| s.phase("T1") == Phase::Stopping).await;
     w.r("r1").mend();

@@ -7,7 +7,7 @@ use midshift_core::reason::Code;
 use midshift_core::robot::{Mode, Presence};
 use midshift_core::rows::{Item, Writer};
 use midshift_core::site::CORRIDOR;
-use midshift_core::task::{Attempt, Phase, TaskState, Then};
+use midshift_core::task::{AfterStopping, Attempt, Phase, TaskState};
 use midshift_core::work::PresenceRow;
 use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
@@ -69,7 +69,7 @@ async fn no_timer_fires_in_the_first_ten_seconds_and_what_was_left_goes_on() {
     w.pass_while(9, "robots say hello first", |s| s.phase("T1") == Phase::Assigned).await;
     w.pass(3).await;
     let seen = w.seen().await;
-    assert_eq!((seen.phase("T1"), seen.task("T1").then), (Phase::Stopping, Some(Then::Requeue)));
+    assert_eq!((seen.phase("T1"), seen.task("T1").then), (Phase::Stopping, Some(AfterStopping::Requeue)));
     w.lawful().await;
 }
 

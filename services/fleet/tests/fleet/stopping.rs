@@ -5,7 +5,7 @@ use midshift_core::fleet::rows::HolderState;
 use midshift_core::ids::TaskId;
 use midshift_core::reason::Code;
 use midshift_core::site::CORRIDOR;
-use midshift_core::task::{Ask, AttemptPhase, Phase, Resolution, Then};
+use midshift_core::task::{AfterStopping, Ask, AttemptPhase, Phase, Resolution};
 use midshift_core::work::WorkState;
 
 #[tokio::test(start_paused = true)]
@@ -28,7 +28,10 @@ async fn a_running_task_is_canceled_only_when_the_robot_has_stopped() {
     w.r("r1").confirms = false;
     w.cancel("T1", false).await;
     let seen = w.until_phase("T1", Phase::Stopping).await;
-    assert_eq!((seen.task("T1").then, seen.work("r1").assignment.map(|a| a.stop)), (Some(Then::Canceled), Some(true)));
+    assert_eq!(
+        (seen.task("T1").then, seen.work("r1").assignment.map(|a| a.stop)),
+        (Some(AfterStopping::Canceled), Some(true))
+    );
     w.pass_while(10, "the robot is kept", |s| s.phase("T1") == Phase::Stopping && !s.is_free("r1")).await;
     let attempt = w.seen().await.task("T1").attempt_id().expect("an attempt");
     w.r("r1").reports(attempt, WorkState::Aborted);
@@ -103,7 +106,7 @@ async fn canceled_while_nobody_knew() -> World {
     w.r("r1").cut();
     w.until("nobody knows", |s| s.is_uncertain("T1")).await;
     w.cancel("T1", false).await;
-    w.until("the wish is kept", |s| s.task("T1").then == Some(Then::Canceled)).await;
+    w.until("the wish is kept", |s| s.task("T1").then == Some(AfterStopping::Canceled)).await;
     w.r("r1").mend();
     w
 }
