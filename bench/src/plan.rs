@@ -4,7 +4,7 @@
 use crate::figure::{Figure, percentile};
 use crate::old_store::{self, OldArgs};
 use midshift_core::fleet::projection::{FleetProjection, RevisedRow};
-use midshift_core::fleet::{Board, Pace, Plan, Slice, cycle, found};
+use midshift_core::fleet::{Board, Pace, Plan, Slice, cycle, ensure_site_rows};
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::{Inventory, ReportedState, Vitals};
 use midshift_core::rows::{Record, Revision, Row};
@@ -152,7 +152,7 @@ fn cycle_ms(site: &Arc<Site>, router: &Arc<Router>, kind: Fleet, robots: usize, 
     view.router = router.clone();
     // One slice for all: what the whole fleet costs, however many turns it is cut into.
     let mut plan = Plan::for_slice(Slice::for_decisions(2 * robots));
-    found(&mut view, now, "", &Default::default(), &mut plan);
+    ensure_site_rows(&mut view, now, "", &Default::default(), &mut plan);
     let begun = instant();
     cycle(&mut view, now, &board, Pace::Wake, &mut plan);
     let took = begun.elapsed().as_secs_f64() * 1e3;

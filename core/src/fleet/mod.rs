@@ -66,8 +66,8 @@ pub fn contenders(is_shared: bool, bugs: bugs::Bugs) -> Contenders {
     }
 }
 
-/// Rows every start makes sure of: the site, its places, and serving time.
-pub fn found(view: &mut FleetProjection, now: Now, site_text: &str, map: &maps::MapChange, plan: &mut Plan) {
+/// Ensures the rows that every start needs: the site, its places, and serving time.
+pub fn ensure_site_rows(view: &mut FleetProjection, now: Now, site_text: &str, map: &maps::MapChange, plan: &mut Plan) {
     maps::tell_of_change(view, now, map, plan);
     let site = view.site.clone();
     if view.sites.get(site.site_id().as_str()).is_some_and(|stored| stored.row.text != site_text) {

@@ -8,7 +8,9 @@
 
 use crate::requests::{Look, MapOutdated, Parts, PendingCommand, Request};
 use midshift_core::fleet::projection::{self, FleetProjection};
-use midshift_core::fleet::{Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, explain, found, maps, objects};
+use midshift_core::fleet::{
+    Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, ensure_site_rows, explain, maps, objects,
+};
 use midshift_core::idempotency;
 use midshift_core::identity::Actor;
 use midshift_core::leadership::{FleetLeader, LeaderLease, LeaseAction, OwnEntries};
@@ -244,7 +246,7 @@ impl Loop {
             return Ok(());
         }
         let mut plan = Plan::default();
-        found(&mut self.view, self.parts.clock.now(), &self.parts.site_text, &self.parts.map, &mut plan);
+        ensure_site_rows(&mut self.view, self.parts.clock.now(), &self.parts.site_text, &self.parts.map, &mut plan);
         let entries: Vec<u64> = plan.items.iter().map(entries_of).collect();
         for (result, entries) in self.parts.store.commit(plan.items).await.into_iter().zip(entries) {
             let applied = result.map_err(|error| Error::Unavailable(std::sync::Arc::new(error)))?;

@@ -25,7 +25,7 @@ pub(in crate::fleet) fn gather(view: &mut FleetProjection, now: Now, board: &Boa
     let mut heard: BTreeSet<RobotId> = known.filter(|r| repair::is_due(view, r, board, &now)).cloned().collect();
     heard.append(&mut view.agenda.heard);
     view.agenda = Agenda { timers, late, suspended, heard };
-    let worn = desired::wearing(view, board);
+    let worn = desired::find_expiring_permissions(view, board);
     view.dirty.extend(worn);
 }
 

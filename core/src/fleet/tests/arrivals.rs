@@ -7,7 +7,7 @@ use crate::fleet::facts::inbox;
 use crate::fleet::maps::MapChange;
 use crate::fleet::rows::{HolderState, PlaceHolder};
 use crate::fleet::tasks::claims;
-use crate::fleet::{Board, Pace, Plan, Tally, found};
+use crate::fleet::{Board, Pace, Plan, Tally, ensure_site_rows};
 use crate::ids::{AttemptId, PlaceId, RobotId, WaypointId};
 use crate::reason::{Code, Reason};
 use crate::robot::{FAULT_DISBELIEVED, Lane, WorkState};
@@ -41,7 +41,7 @@ fn given_at(waypoint: &str, change: impl FnOnce(&mut RawTask)) -> Rig {
 
 /// What every start of the server makes sure of.
 fn start(rig: &mut Rig) {
-    found(&mut rig.view, rig.now, CORRIDOR, &MapChange::Taken, &mut Plan::default());
+    ensure_site_rows(&mut rig.view, rig.now, CORRIDOR, &MapChange::Taken, &mut Plan::default());
 }
 
 fn given() -> Rig {

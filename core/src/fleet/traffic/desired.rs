@@ -217,8 +217,8 @@ fn closed(
     closed
 }
 
-/// Robots whose permissions wear out while they stand unused.
-pub fn wearing(view: &FleetProjection, board: &Board) -> Vec<RobotId> {
+/// Finds robots whose permissions expire while they stand unused.
+pub fn find_expiring_permissions(view: &FleetProjection, board: &Board) -> Vec<RobotId> {
     let worn = |d: &DesiredWork| {
         let live = board.get(&d.robot_id).map(|l| &**l);
         if d.held && live.is_some() && !is_held(view, &d.robot_id) {
