@@ -39,7 +39,7 @@ pub fn plan(
     let mut walk = view.queue.walk(&present, heard);
     idle.retain(&walk.robots);
     errands.retain(&walk.robots);
-    let mut recalled = errand_reports::stopping(view);
+    let mut recalled = errand_reports::count_stopping(view);
     while !(idle.is_empty() && errands.is_empty()) {
         if plan.is_cut() {
             view.queue.pause(walk);
@@ -61,7 +61,7 @@ pub fn plan(
         if recalled > 0 {
             recalled -= 1;
         } else if let Some(robot_id) = errands.take_nearest(view, board, task, intake, &now, &mut plan.slice) {
-            plan.decide(view, now, "fleet", |tx| errand_reports::stop(tx, &robot_id));
+            plan.decide(view, now, "fleet", |tx| errand_reports::stop_errand(tx, &robot_id));
         }
     }
     let left = idle.robots().chain(errands.robots()).cloned().collect();

@@ -19,8 +19,8 @@ use crate::reason::{Code, Reason};
 use crate::time::{LinkDuration, Now};
 use crate::work::AttemptReport;
 
-/// A robot heard an offer and did not answer it.
-pub fn missed(tx: &mut Tx, robot_id: &RobotId) {
+/// Notes that a robot heard an offer and did not answer it.
+pub fn note_missed_offer(tx: &mut Tx, robot_id: &RobotId) {
     let now = tx.now;
     let answers = &mut tx.view.answers;
     answers.missed.insert(robot_id.clone(), now.link);
@@ -28,21 +28,21 @@ pub fn missed(tx: &mut Tx, robot_id: &RobotId) {
     let at_once: Vec<RobotId> = answers.missed.keys().cloned().collect();
     let in_row = answers.backed_off.get(robot_id).map_or(1, |(n, _)| n.saturating_add(1));
     if are_many(at_once.len(), tx.view.sessions.len()) {
-        at_once.iter().for_each(|robot_id| excuse(tx, robot_id));
+        at_once.iter().for_each(|robot_id| excuse_missed_offer(tx, robot_id));
         let reason = Reason::from(Code::OffersNotAnswered).with("robots", at_once.len());
         incidents::open_about(tx, reason, None, "");
         return back_off(tx, robot_id, 1);
     }
     back_off(tx, robot_id, in_row);
-    count(tx, robot_id);
+    count_missed_offer(tx, robot_id);
 }
 
-/// A robot refused an offer. For what the task asks for, which is the task's matter, or for its own sake: then it is passed over, so that it
+/// Notes that a robot refused an offer: for what the task asks for, which is the task's matter, or for its own sake: then it is passed over, so that it
 /// uses up no patience of tasks that others could take.
-pub fn refused(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
+pub fn note_refused_offer(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
     let code = report.refusal.as_ref().map(|why| why.code);
     if code == Some(Code::UnsupportedAction) {
-        return answered(tx, robot_id);
+        return note_answer(tx, robot_id);
     }
     let in_row = tx.view.answers.backed_off.get(robot_id).map_or(1, |(n, _)| n.saturating_add(1));
     back_off(tx, robot_id, in_row);
@@ -75,8 +75,8 @@ fn control(tx: &Tx, robot_id: &RobotId) -> RobotControl {
     known.unwrap_or_else(|| RobotControl::new(robot_id.clone()))
 }
 
-/// Counts it, and opens the breaker at the third.
-fn count(tx: &mut Tx, robot_id: &RobotId) {
+/// Counts a missed offer, and opens the breaker at the third.
+fn count_missed_offer(tx: &mut Tx, robot_id: &RobotId) {
     let (mut control, now) = (control(tx, robot_id), tx.now.utc);
     control.unanswered.retain(|at| now.ms_since(*at) <= limits::BREAKER_WINDOW.as_ms());
     control.unanswered.push(now);
@@ -87,8 +87,8 @@ fn count(tx: &mut Tx, robot_id: &RobotId) {
     }
 }
 
-/// Takes back what was counted a moment ago.
-fn excuse(tx: &mut Tx, robot_id: &RobotId) {
+/// Takes back the missed offers that were counted a moment ago.
+fn excuse_missed_offer(tx: &mut Tx, robot_id: &RobotId) {
     let (mut control, now) = (control(tx, robot_id), tx.now.utc);
     let before = (control.unanswered.len(), control.unanswered_since);
     let window = limits::BREAKER_WINDOW.as_ms();
@@ -100,8 +100,8 @@ fn excuse(tx: &mut Tx, robot_id: &RobotId) {
     }
 }
 
-/// The robot took an offer, or refused it for what the task asks for.
-pub fn answered(tx: &mut Tx, robot_id: &RobotId) {
+/// Notes that a robot took an offer, or refused it for what the task asks for.
+pub fn note_answer(tx: &mut Tx, robot_id: &RobotId) {
     tx.view.answers.missed.remove(robot_id);
     tx.view.answers.backed_off.remove(robot_id);
     let control = control(tx, robot_id);
@@ -151,7 +151,7 @@ mod tests {
 
     fn miss(view: &mut FleetProjection, n: usize, secs: u64) {
         let mut tx = Tx::new(view, at(secs), "tests");
-        missed(&mut tx, &robot(n));
+        note_missed_offer(&mut tx, &robot(n));
     }
 
     fn code(view: &FleetProjection, n: usize, secs: u64) -> Option<Code> {
@@ -172,7 +172,7 @@ mod tests {
         assert_eq!(code(&view, 1, 1_330), Some(Code::RobotDoesNotAnswer), "a probe that is not answered opens it anew");
         assert_eq!(view.incidents.len(), 1);
         let mut tx = Tx::new(&mut view, at(1_400), "tests");
-        answered(&mut tx, &robot(1));
+        note_answer(&mut tx, &robot(1));
         assert_eq!(code(&view, 1, 1_400), None);
         assert!(view.incidents.values().all(|i| i.row.closed.is_some()), "it closes by itself");
     }

@@ -78,6 +78,6 @@ pub fn doubt(tx: &mut Tx, robot_id: &RobotId, id: &AttemptId, why: &Reason) {
         Some(task_id) => {
             apply_event(tx, task_id, News::from_event(Event::LeaseOver, Some(why)));
         }
-        None => errand_reports::lease_over(tx, robot_id, why.clone()),
+        None => errand_reports::mark_uncertain(tx, robot_id, why.clone()),
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! Invariant: a report counts only for the newest epoch of its task; older ones are fenced and counted, never obeyed.
 
-use super::holds::hardware_stop;
+use super::holds::apply_hardware_stop;
 use super::{answers, disbelief};
 use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Tx;
@@ -37,9 +37,9 @@ pub fn obey_entry(tx: &mut Tx, entry: &InboxEntry, board: &Board, tally: &mut Ta
         RobotEvent::Attempt(report) => {
             breaker::count_let_go(tx, robot_id, report);
             if calls_offer_over(tx.view, robot_id, report) {
-                answers::refused(tx, robot_id, report);
+                answers::note_refused_offer(tx, robot_id, report);
             }
-            attempt(tx, robot_id, report, tally);
+            apply_attempt_report(tx, robot_id, report, tally);
         }
         RobotEvent::Place { place_id, grant_id, news: PlaceNews::Entered }
             if claims::waits_for_heartbeat(tx.view, board, robot_id, place_id) =>
@@ -47,14 +47,14 @@ pub fn obey_entry(tx: &mut Tx, entry: &InboxEntry, board: &Board, tally: &mut Ta
             arrivals::note(tx, robot_id, place_id);
             claims::check_grant(tx, robot_id, place_id, *grant_id);
         }
-        RobotEvent::Place { place_id, grant_id, news } => place(tx, robot_id, place_id, *grant_id, *news),
-        RobotEvent::Mode(mode) => mode_changed(tx, robot_id, *mode),
-        RobotEvent::HardwareStop(stop) => hardware_stop(tx, robot_id, *stop),
+        RobotEvent::Place { place_id, grant_id, news } => apply_place_news(tx, robot_id, place_id, *grant_id, *news),
+        RobotEvent::Mode(mode) => apply_mode(tx, robot_id, *mode),
+        RobotEvent::HardwareStop(stop) => apply_hardware_stop(tx, robot_id, *stop),
         RobotEvent::StaleAuthority { what, .. } if what == UNREADABLE_WORK => {
             incidents::open_about(tx, Code::WorkUnreadable.into(), Some(robot_id), "");
         }
         RobotEvent::StaleAuthority { .. } => tally.stale_authority += 1,
-        RobotEvent::Load(Some(load)) => carries(tx, robot_id, load),
+        RobotEvent::Load(Some(load)) => note_load(tx, robot_id, load),
         // The rollout service reads these itself.
         RobotEvent::Update(_) => {}
         // Its heartbeat says the same, and holds come of that.
@@ -70,20 +70,20 @@ fn calls_offer_over(view: &FleetProjection, robot_id: &RobotId, report: &Attempt
     stands && matches!(report.state, WorkState::Aborted | WorkState::Suspended)
 }
 
-/// Obeys news of an attempt, from the inbox or from an inventory.
-pub fn attempt(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, tally: &mut Tally) {
+/// Applies a report of an attempt, from the inbox or from an inventory.
+pub fn apply_attempt_report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, tally: &mut Tally) {
     let id = &report.attempt;
     let is_offer = tx.view.attempt(id).is_some_and(|a| a.accepted.is_none() && a.robot_id == *robot_id);
     if is_offer && report.state == WorkState::Refused {
-        answers::refused(tx, robot_id, report);
+        answers::note_refused_offer(tx, robot_id, report);
     } else if is_offer && !matches!(report.state, WorkState::Aborted | WorkState::Suspended) {
-        answers::answered(tx, robot_id);
+        answers::note_answer(tx, robot_id);
     }
     if let Some(why) = plausible::judge(tx.view, id, robot_id, report.state, report.step_index) {
         return disbelief::doubt(tx, robot_id, id, &why);
     }
     let Some(task_id) = id.subject.task_id() else {
-        errand_reports::report(tx, robot_id, report);
+        errand_reports::apply_report(tx, robot_id, report);
         return;
     };
     let newest = tx.view.task(task_id).and_then(|t| t.attempt_id());
@@ -105,9 +105,9 @@ pub fn attempt(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, tally: &
     }
 }
 
-/// The robot says that it carries something: an item of the task it works on opens that task, whatever else it says.
-pub fn carries(tx: &mut Tx, robot_id: &RobotId, load: &Load) {
-    let task = load.task_id.as_ref().and_then(|id| tx.view.task(id)).filter(|t| t.opened_robot_id.is_none());
+/// Notes the load that a robot says it carries: an item of the task it works on opens that task, whatever else it says.
+pub fn note_load(tx: &mut Tx, robot_id: &RobotId, load: &Load) {
+    let task = load.task_id.as_ref().and_then(|id| tx.view.task(id)).filter(|t| t.opened.is_none());
     let attempt = task.and_then(|t| t.attempt_id()).filter(|id| tx.view.held_by(robot_id) == Some(id));
     let Some((mut task, id)) = task.cloned().zip(attempt) else { return };
     task.opened_robot_id = Some(robot_id.clone());
@@ -118,8 +118,8 @@ pub fn carries(tx: &mut Tx, robot_id: &RobotId, load: &Load) {
     }
 }
 
-/// Obeys news of a place.
-pub fn place(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64, news: PlaceNews) {
+/// Applies news of a place.
+pub fn apply_place_news(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64, news: PlaceNews) {
     let known = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone());
     let holder = known.as_ref().map(|place| place.holder(robot_id));
     // Of a place whose row cannot be read nobody knows whether it stood there.
@@ -161,7 +161,7 @@ pub fn place(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId, grant_id: u64,
 }
 
 /// A person took the robot over: what it has becomes UNCERTAIN. Back in automatic mode, its heartbeat says what it still has.
-fn mode_changed(tx: &mut Tx, robot_id: &RobotId, mode: Mode) {
+fn apply_mode(tx: &mut Tx, robot_id: &RobotId, mode: Mode) {
     tx.view.dirty.insert(robot_id.clone());
     if mode == Mode::Automatic {
         return;
@@ -171,7 +171,7 @@ fn mode_changed(tx: &mut Tx, robot_id: &RobotId, mode: Mode) {
         Some(Some(task_id)) => {
             apply_event(tx, &task_id, News::from_event(Event::LeaseOver, Some(&why)));
         }
-        Some(None) => errand_reports::lease_over(tx, robot_id, why),
+        Some(None) => errand_reports::mark_uncertain(tx, robot_id, why),
         None => {}
     }
 }

@@ -22,8 +22,8 @@ use crate::task::{Attempt, AttemptPhase, Event, Phase};
 use crate::time::Now;
 use crate::work::{AttemptReport, Live, PlaceNews, WorkState};
 
-/// Counts the time in which the robot is heard.
-fn attached(view: &mut FleetProjection, robot_id: &RobotId, board: &Board, now: &Now) {
+/// Counts the time in which a robot is heard.
+fn count_attached_time(view: &mut FleetProjection, robot_id: &RobotId, board: &Board, now: &Now) {
     let heard = presence(board, robot_id, now) == Presence::Online;
     let fresh = Attached { ms: 0, until: now.site, is_heard: heard };
     let time = view.attached.entry(robot_id.clone()).or_insert(fresh);
@@ -42,30 +42,30 @@ pub fn is_due(view: &FleetProjection, robot_id: &RobotId, board: &Board, now: &N
 }
 
 /// Repairs one robot, in items that each stay below their limits however long the robot's lists are.
-pub fn robot(view: &mut FleetProjection, now: Now, robot_id: &RobotId, board: &Board, plan: &mut Plan) {
-    attached(view, robot_id, board, &now);
+pub fn repair_robot(view: &mut FleetProjection, now: Now, robot_id: &RobotId, board: &Board, plan: &mut Plan) {
+    count_attached_time(view, robot_id, board, &now);
     let mut tally = plan.report.tally;
     plan.decide(view, now, "fleet", |tx| {
         transitions::count_hours(tx, robot_id);
         if !lease_stands(tx.view, board, robot_id, &now) {
-            return lease_over(tx, robot_id, &mut tally);
+            return end_lease(tx, robot_id, &mut tally);
         }
         if let Some(live) = board.get(robot_id) {
             load::end_word(tx, live);
             if let Some(load) = load::carried(tx.view, live) {
-                inbox::carries(tx, robot_id, load);
+                inbox::note_load(tx, robot_id, load);
             }
-            stalled(tx, robot_id, live);
+            detect_stall(tx, robot_id, live);
         }
     });
     if let Some(live) = board.get(robot_id).filter(|_| lease_stands(view, board, robot_id, &now)) {
-        compare(view, now, live, &mut tally, plan);
+        compare_heartbeat(view, now, live, &mut tally, plan);
     }
     plan.report.tally = tally;
 }
 
 /// Compares the rows with a heartbeat, if its differences count.
-fn compare(view: &mut FleetProjection, now: Now, live: &Live, tally: &mut Tally, plan: &mut Plan) {
+fn compare_heartbeat(view: &mut FleetProjection, now: Now, live: &Live, tally: &mut Tally, plan: &mut Plan) {
     if !is_settled(view, live) || !is_fresh(view, live) {
         tally.pending += 1;
         return;
@@ -75,7 +75,7 @@ fn compare(view: &mut FleetProjection, now: Now, live: &Live, tally: &mut Tally,
     let doubt = plausible::doubtful(view, live);
     let stop = live.report.hardware_stop;
     if doubt.is_none() || stop != HardwareStop::None {
-        plan.decide(view, now, "fleet", |tx| holds::hardware_stop(tx, robot_id, stop));
+        plan.decide(view, now, "fleet", |tx| holds::apply_hardware_stop(tx, robot_id, stop));
     }
     repair_places(view, now, live, doubt.is_none(), plan);
     if let Some((id, why)) = doubt {
@@ -84,16 +84,16 @@ fn compare(view: &mut FleetProjection, now: Now, live: &Live, tally: &mut Tally,
     }
     plan.decide(view, now, "fleet", |tx| {
         arrivals::note_standing(tx, live);
-        attempt(tx, robot_id, live, tally);
-        unknown(tx, robot_id, live);
-        recharge(tx, robot_id, live);
+        repair_attempt(tx, robot_id, live, tally);
+        note_unknown_attempt(tx, robot_id, live);
+        suspend_to_charge(tx, robot_id, live);
         forget_reported(tx, robot_id, live);
         maps::compare(tx, live);
     });
 }
 
-/// A robot at work must charge: a preemptible task that it has not opened waits, at a step boundary.
-fn recharge(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+/// Suspends the task of a robot that must charge: a preemptible one that it has not opened, at a step boundary.
+fn suspend_to_charge(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     let Some(task_id) = tx.view.held_by(robot_id).and_then(|id| id.subject.task_id()).cloned() else { return };
     let vitals = &live.report.vitals;
     if !may_suspend(tx.view, &task_id, live) || tx.view.site.chargers().next().is_none() {
@@ -110,12 +110,13 @@ fn recharge(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     }
 }
 
-fn lease_over(tx: &mut Tx, robot_id: &RobotId, tally: &mut Tally) {
+/// Ends the authority of a robot whose lease is over: its attempt becomes UNCERTAIN.
+fn end_lease(tx: &mut Tx, robot_id: &RobotId, tally: &mut Tally) {
     if tx.view.bugs.timeout_frees_place() {
         for id in transitions::places_of(tx, robot_id) {
             let holder = tx.view.places.get(&id).and_then(|p| p.row.holder(robot_id).cloned());
             if let (Some(holder), Ok(place_id)) = (holder, crate::ids::PlaceId::parse(&id)) {
-                inbox::place(tx, robot_id, &place_id, holder.grant_id, PlaceNews::Left);
+                inbox::apply_place_news(tx, robot_id, &place_id, holder.grant_id, PlaceNews::Left);
             }
         }
     }
@@ -135,19 +136,19 @@ fn lease_over(tx: &mut Tx, robot_id: &RobotId, tally: &mut Tally) {
             fault: None,
             stats,
         };
-        return inbox::attempt(tx, robot_id, &gone, tally);
+        return inbox::apply_attempt_report(tx, robot_id, &gone, tally);
     }
     let why = Reason::from(Code::LeaseOver).with("robot_id", robot_id);
     match id.subject.task_id() {
         Some(task_id) => {
             apply_event(tx, task_id, News::from_event(Event::LeaseOver, Some(&why)));
         }
-        None => errand_reports::lease_over(tx, robot_id, why),
+        None => errand_reports::mark_uncertain(tx, robot_id, why),
     }
 }
 
-/// The attempt that holds the robot, against what the robot lists.
-fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
+/// Repairs the attempt that holds a robot from the attempts that the robot lists.
+fn repair_attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
     let Some(id) = tx.view.held_by(robot_id).cloned() else { return };
     let Some(a) = tx.view.attempt(&id).cloned() else { return };
     let listed = live.report.attempts.iter().find(|r| r.attempt == id);
@@ -164,13 +165,13 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
         tally.repaired += 1;
         match arrivals::unseen(tx.view, &tx.now, robot_id, report) {
             Some(place_id) => disbelief::disbelieve(tx, robot_id, report, &place_id),
-            None => inbox::attempt(tx, robot_id, report, tally),
+            None => inbox::apply_attempt_report(tx, robot_id, report, tally),
         }
     };
     match listed {
         None => {
             if is_unanswered(tx.view, &a, live) {
-                answers::missed(tx, robot_id);
+                answers::note_missed_offer(tx, robot_id);
             }
             is_over(tx, &report(WorkState::Aborted));
         }
@@ -182,8 +183,8 @@ fn attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
             apply_event(tx, task_id, News { event: Event::StepUnknown, why: None, report: Some(&report) });
         }
         Some(l) if needs_sight(&a, live) => {
-            answers::answered(tx, robot_id);
-            let Some(task_id) = id.subject.task_id() else { return errand_reports::seen(tx, robot_id) };
+            answers::note_answer(tx, robot_id);
+            let Some(task_id) = id.subject.task_id() else { return errand_reports::note_heard(tx, robot_id) };
             tally.repaired += 1;
             let report = report(l.state);
             apply_event(tx, task_id, News { event: Event::SeenRunning, why: None, report: Some(&report) });
@@ -209,8 +210,8 @@ fn is_unanswered(view: &FleetProjection, a: &Attempt, live: &Live) -> bool {
     is_sent && waits && a.accepted.is_none() && a.offer.session_epoch == live.report.session_epoch
 }
 
-/// An attempt that the robot has and no row knows: it was told of no work; if it does not let go, a person is told.
-fn unknown(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+/// Notes an attempt that a robot lists and no row knows. If the robot keeps it, an incident is opened.
+fn note_unknown_attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     forget_disowned(tx, robot_id, live);
     let Some(attempt) = unknown_attempt(tx.view, live).cloned() else {
         tx.view.unknown.remove(robot_id);
@@ -262,7 +263,8 @@ fn forget_reported(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     }
 }
 
-fn stalled(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+/// Fires the event of a stall if a robot at work has reported no progress for longer than its task allows.
+fn detect_stall(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
     let Some(task_id) = tx.view.held_by(robot_id).and_then(|a| a.subject.task_id().cloned()) else { return };
     let Some(task) = tx.view.task(&task_id) else { return };
     let Some(intake) = tx.view.intake(&task_id) else { return };
@@ -296,7 +298,7 @@ fn repair_places(view: &mut FleetProjection, now: Now, live: &Live, sound: bool,
     for some in changes.chunks(limits::PLACES_PER_ITEM) {
         plan.decide(view, now, "fleet", |tx| {
             for (place_id, grant_id, news) in some {
-                inbox::place(tx, robot_id, place_id, *grant_id, *news);
+                inbox::apply_place_news(tx, robot_id, place_id, *grant_id, *news);
             }
         });
     }

@@ -40,7 +40,7 @@ pub(in crate::fleet) fn carry_out(
     while let Some(robot_id) = view.agenda.heard.first().filter(|_| !plan.is_cut()).cloned() {
         view.agenda.heard.remove(&robot_id);
         plan.slice.count_looks(1);
-        repair::robot(view, now, &robot_id, board, plan);
+        repair::repair_robot(view, now, &robot_id, board, plan);
         compared.insert(robot_id);
     }
     plan.slice.renew();

@@ -161,7 +161,7 @@ fn further(tx: &mut Tx, drain: &Drain, board: &Board) {
             }
             // A charge ends as it is: the robot keeps its place and goes on charging. A way to a charger or to a park goes on.
             None if tx.view.attempt(&id).is_some_and(errand_reports::is_docked) => {
-                errand_reports::stop(tx, &drain.robot_id)
+                errand_reports::stop_errand(tx, &drain.robot_id)
             }
             None => {}
         },

@@ -14,13 +14,13 @@ use crate::task::state::{Errand, Uncertain};
 use crate::task::{Attempt, AttemptPhase};
 use crate::work::{AttemptReport, WorkState};
 
-/// Errands that are on their way to a stop.
-pub fn stopping(view: &FleetProjection) -> usize {
+/// Counts errands that are on their way to a stop.
+pub fn count_stopping(view: &FleetProjection) -> usize {
     view.attempts.values().filter(|a| a.row.errand.is_some() && a.row.phase == AttemptPhase::Stopping).count()
 }
 
-/// Takes the robot's report of its errand.
-pub fn report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
+/// Applies the robot's report of its errand.
+pub fn apply_report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport) {
     if tx.view.held_by(robot_id) != Some(&report.attempt) {
         return;
     }
@@ -72,7 +72,7 @@ pub(in crate::fleet) fn is_docked(a: &Attempt) -> bool {
 }
 
 /// Asks the robot to break its errand off.
-pub fn stop(tx: &mut Tx, robot_id: &RobotId) {
+pub fn stop_errand(tx: &mut Tx, robot_id: &RobotId) {
     let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
     if a.errand.is_none() || a.phase.is_terminal() || a.phase == AttemptPhase::Stopping {
         return;
@@ -82,25 +82,25 @@ pub fn stop(tx: &mut Tx, robot_id: &RobotId) {
     tx.put_row(a, "errand.stopping");
 }
 
-/// A timer of an errand fired: an unanswered offer is taken back; everything else waits for the robot's report.
-pub fn fire(tx: &mut Tx, timer: &Timer) {
+/// Handles a timer of an errand: an unanswered offer is taken back; everything else waits for the robot's report.
+pub fn fire_timer(tx: &mut Tx, timer: &Timer) {
     disarm(tx, timer.kind, &timer.attempt);
     if timer.kind == TimerKind::OfferAck
         && let Some(robot_id) = tx.view.attempt(&timer.attempt).map(|a| a.robot_id.clone())
     {
-        stop(tx, &robot_id);
+        stop_errand(tx, &robot_id);
     }
 }
 
-/// The robot was not heard for longer than its authority.
-pub fn lease_over(tx: &mut Tx, robot_id: &RobotId, cause: Reason) {
+/// Marks the errand of a robot as uncertain, that was not heard for longer than its authority or is in manual mode.
+pub fn mark_uncertain(tx: &mut Tx, robot_id: &RobotId, cause: Reason) {
     let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
     a.uncertain = Some(Uncertain { since: tx.now.utc, cause });
     tx.put_row(a, "errand.uncertain");
 }
 
-/// The robot is heard again and still lists its errand.
-pub fn seen(tx: &mut Tx, robot_id: &RobotId) {
+/// Notes that a robot is heard again and still lists its errand.
+pub fn note_heard(tx: &mut Tx, robot_id: &RobotId) {
     let Some(mut a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
     a.uncertain = None;
     if a.accepted.is_none() {

@@ -42,7 +42,7 @@ pub(in crate::fleet) fn is_late(view: &FleetProjection, task_id: &TaskId, now: &
 /// Fires one timer.
 pub fn fire(tx: &mut Tx, timer: &Timer, board: &Board) {
     let Some(task_id) = timer.attempt.subject.task_id().cloned() else {
-        errand_reports::fire(tx, timer);
+        errand_reports::fire_timer(tx, timer);
         return;
     };
     let current = tx.view.task(&task_id).and_then(|t| t.attempt_id()).as_ref() == Some(&timer.attempt)
