@@ -202,8 +202,8 @@ fn try_lock(file: &File, path: &Path, how: FlockOperation) -> Result<bool, Disk>
     }
 }
 
-/// That a process works in the folder, until it is dropped.
-pub struct Presence {
+/// The lock by which a process works in the folder of releases, alone or with others, until it is dropped.
+pub struct FolderLock {
     file: File,
     path: PathBuf,
     is_shared: bool,
@@ -213,15 +213,15 @@ pub struct Presence {
     pub is_first: bool,
 }
 
-impl Presence {
+impl FolderLock {
     /// Takes the lock of the folder for this process, after making the folder if it is missing, and settles its owner.
     /// None: the owner is [`Owner::Nobody`], and there is no lock. The first process keeps others waiting until
-    /// [`Presence::let_in`].
+    /// [`FolderLock::let_in`].
     ///
     /// # Errors
     /// If the folder is another store's, has no marker and may not be taken, or is in use by a process that it cannot
     /// be shared with.
-    pub async fn come(folder: &Path, owner: &Owner) -> Result<Option<Self>, Error> {
+    pub async fn acquire(folder: &Path, owner: &Owner) -> Result<Option<Self>, Error> {
         if *owner == Owner::Nobody {
             return Ok(None);
         }

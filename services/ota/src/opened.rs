@@ -3,7 +3,7 @@
 use crate::collect::{Collector, Named};
 use crate::content::Content;
 use crate::downloads::Downloads;
-use crate::folder::Presence;
+use crate::folder::FolderLock;
 use crate::repository::{Repository, every_second};
 use midshift_core::time::{Clock, Utc};
 use std::sync::Arc;
@@ -25,12 +25,12 @@ pub(crate) struct Opened {
     pub(crate) clock: Arc<dyn Clock>,
     pub(crate) downloads: Downloads,
     /// Ends with the service.
-    pub(crate) presence: Option<Presence>,
+    pub(crate) lock: Option<FolderLock>,
 }
 
 impl Opened {
     fn is_shared(&self) -> bool {
-        self.presence.as_ref().is_some_and(Presence::is_shared)
+        self.lock.as_ref().is_some_and(FolderLock::is_shared)
     }
 
     /// Tries files and keys again that could not be read, and learns what other processes publish.

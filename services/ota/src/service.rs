@@ -3,7 +3,7 @@
 use crate::collect::Collector;
 use crate::content::{Content, DiskContent, Room, Sharing};
 use crate::downloads::{Downloads, add_bundles, add_chunks};
-use crate::folder::{self, Gate, Owner, Presence};
+use crate::folder::{self, FolderLock, Gate, Owner};
 use crate::http1;
 use crate::opened::Opened;
 use crate::repository::{Error, OnlineKeys, Repository};
@@ -56,9 +56,9 @@ impl OtaService {
     }
     async fn opening(Parts { folder, keys, room, clock, owner }: Parts) -> Result<Self, Error> {
         let keys = blocking(move || OnlineKeys::read(&keys)).await?;
-        let presence = Presence::come(&folder, &owner).await?;
-        let sharing = presence.as_ref().filter(|_| matches!(owner, Owner::Shared { .. }));
-        let sharing = sharing.map(|presence| (presence.number, presence.is_first));
+        let lock = FolderLock::acquire(&folder, &owner).await?;
+        let sharing = lock.as_ref().filter(|_| matches!(owner, Owner::Shared { .. }));
+        let sharing = sharing.map(|lock| (lock.number, lock.is_first));
         let of = folder.clone();
         let (content, collector) = blocking(move || {
             if sharing.is_none_or(|(_, is_first)| is_first) {
@@ -76,8 +76,8 @@ impl OtaService {
             Ok::<_, Error>((content, collector))
         })
         .await?;
-        if let Some(presence) = &presence {
-            presence.let_in().await?;
+        if let Some(lock) = &lock {
+            lock.let_in().await?;
         }
         let metadata = folder.join("metadata");
         let repository = if sharing.is_some() {
@@ -88,7 +88,7 @@ impl OtaService {
         let repository = repository.with_clock(clock.clone());
         let downloads = Downloads::new(content.clone(), repository.documents().clone());
         let (named, leads) = (watch::Sender::new(None), watch::Sender::new(true));
-        let opened = Opened { content, repository, collector, named, leads, clock, downloads, presence };
+        let opened = Opened { content, repository, collector, named, leads, clock, downloads, lock };
         Ok(Self { opened: Some(Arc::new(opened)), rows: None })
     }
     /// A service of a server without keys: it touches no disk and answers every call with what to do.

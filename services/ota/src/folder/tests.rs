@@ -1,6 +1,6 @@
 //! Whose folder it is, who may come in, and that a lock ends with its holder.
 
-use super::{Error, Gate, MARKER, Owner, Presence, must_be_of};
+use super::{Error, FolderLock, Gate, MARKER, Owner, must_be_of};
 use midshift_store::StoreId;
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
@@ -22,7 +22,7 @@ fn shared(id: &str, known_bundles: usize) -> Owner {
 
 /// Comes and goes at once.
 async fn come(dir: &TempDir, owner: &Owner) -> Result<(), Error> {
-    Presence::come(dir.path(), owner).await.map(drop)
+    FolderLock::acquire(dir.path(), owner).await.map(drop)
 }
 
 #[tokio::test]
@@ -88,13 +88,13 @@ async fn what_is_not_there_is_not_made_by_who_reads() {
 #[tokio::test(start_paused = true)]
 async fn who_is_alone_shares_with_nobody_and_who_shares_with_nobody_who_is_alone() {
     let dir = TempDir::new().expect("a folder");
-    let one = Presence::come(dir.path(), &alone("north")).await.expect("alone").expect("asked");
+    let one = FolderLock::acquire(dir.path(), &alone("north")).await.expect("alone").expect("asked");
     one.let_in().await.expect("nobody");
     for owner in [alone("north"), shared("north", 0)] {
         assert!(matches!(come(&dir, &owner).await, Err(Error::InUse { .. })));
     }
     drop(one);
-    let one = Presence::come(dir.path(), &shared("north", 0)).await.expect("first").expect("asked");
+    let one = FolderLock::acquire(dir.path(), &shared("north", 0)).await.expect("first").expect("asked");
     one.let_in().await.expect("others may come");
     assert!(matches!(come(&dir, &alone("north")).await, Err(Error::InUse { .. })));
 }
@@ -103,9 +103,9 @@ async fn who_is_alone_shares_with_nobody_and_who_shares_with_nobody_who_is_alone
 async fn the_first_mends_before_others_come_and_each_has_a_number_of_its_own() {
     let dir = TempDir::new().expect("a folder");
     let owner = shared("north", 0);
-    let first = Presence::come(dir.path(), &owner).await.expect("first").expect("asked");
+    let first = FolderLock::acquire(dir.path(), &owner).await.expect("first").expect("asked");
     assert!(first.is_first);
-    let mut coming = Box::pin(Presence::come(dir.path(), &owner));
+    let mut coming = Box::pin(FolderLock::acquire(dir.path(), &owner));
     for _ in 0..10 {
         tokio::select! {
             biased;
@@ -120,7 +120,7 @@ async fn the_first_mends_before_others_come_and_each_has_a_number_of_its_own() {
     drop((first, second));
     // A program that another test starts in this moment has our locks until it runs its own code.
     let third = loop {
-        let came = Presence::come(dir.path(), &owner).await.expect("let in").expect("asked");
+        let came = FolderLock::acquire(dir.path(), &owner).await.expect("let in").expect("asked");
         if came.is_first {
             break came;
         }
