@@ -108,7 +108,7 @@ async fn play(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Resul
     let tasks = Arc::new(Mutex::new(Tasks::of_run(&run_id, before)));
     let stops = Stops::start(&args, site.clone(), clock.clone(), (address, &*store)).await?;
     let mut swarm = SwarmConfig::tcp(hall.clone(), clock.clone(), &format!("http://{address}"), args.seed)
-        .with_stop(&format!("http://{}", stops.beside.address()));
+        .with_stop(&format!("http://{}", stops.service.address()));
     let live = tasks.clone();
     swarm.person = Some(Arc::new(move |id| task_summary::read_tasks(&live, |t| t.is_live(id))));
     let (software, ota) = Throwaway::make(clock.clone()).await?;
@@ -131,7 +131,7 @@ async fn play(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Resul
         sim: Some(SimFace::new(hall.clone(), clock.clone(), swarm.crash())),
         naive: Naive::default(),
         stops: Some(stops.folder.clone()),
-        stop_port: Some(stops.beside.address().port()),
+        stop_port: Some(stops.service.address().port()),
         jumped_before: None,
         identity: None,
         port: door::alone("business"),
@@ -141,11 +141,19 @@ async fn play(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Resul
     let served_until = CancellationToken::new();
     let server = Server::new(parts, served_until.clone()).await?.hearing(beacons).with_probation(PROBATION_MS);
     let made = (software.keys(), software.repository());
-    say(&greeting(&args, &site, address, stops.beside.address(), made));
+    say(&greeting(&args, &site, address, stops.service.address(), made));
     let stage = match scene {
         Some(scene) => {
             let sight = Sight { store: store.clone(), board: server.board(), site: site.clone(), clock: clock.clone() };
-            Some(scene.stage(&args, &hall_config, &hall, sight, [address, stops.beside.address()], trust, &software)?)
+            Some(scene.stage(
+                &args,
+                &hall_config,
+                &hall,
+                sight,
+                [address, stops.service.address()],
+                trust,
+                &software,
+            )?)
         }
         None => None,
     };

@@ -6,7 +6,7 @@ use midshift_core::site::Site;
 use midshift_core::stop::{FOLDER, PORT};
 use midshift_core::time::Clock;
 use midshift_server::stop_follower;
-use midshift_server::stop_service::{self, Beside};
+use midshift_server::stop_service::{self, InProcessStopService};
 use midshift_store::Store;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -16,7 +16,7 @@ use tempfile::TempDir;
 /// The stop service of the run, in a folder that goes with it unless everything is kept.
 pub struct Stops {
     /// It, beside this process.
-    pub beside: Beside,
+    pub service: InProcessStopService,
     /// Where it keeps its files.
     pub folder: PathBuf,
     _temporary: Option<TempDir>,
@@ -44,7 +44,7 @@ impl Stops {
         };
         stop_service::announce(&folder, store, stop_service::Occasion::Start).await?;
         stop_follower::tell_stops(&folder, store).await?;
-        let beside = Beside::start(folder.clone(), site, clock, listener)?;
-        Ok(Self { beside, folder, _temporary: temporary })
+        let service = InProcessStopService::start(folder.clone(), site, clock, listener)?;
+        Ok(Self { service, folder, _temporary: temporary })
     }
 }

@@ -25,13 +25,13 @@ use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
 /// The stop service of `dev`: a thread with a runtime of its own, so that no plan and no simulated robot holds it up.
-pub struct Beside {
+pub struct InProcessStopService {
     shutdown: CancellationToken,
     thread: Option<std::thread::JoinHandle<anyhow::Result<()>>>,
     address: SocketAddr,
 }
 
-impl Beside {
+impl InProcessStopService {
     /// Begins to serve `listener`.
     ///
     /// # Errors
@@ -69,7 +69,7 @@ impl Beside {
     }
 }
 
-impl Drop for Beside {
+impl Drop for InProcessStopService {
     fn drop(&mut self) {
         self.shutdown.cancel();
         // It ends within its own bounds; why it ended was logged.
