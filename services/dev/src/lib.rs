@@ -30,7 +30,7 @@ use midshift_process::{clock, door};
 use midshift_server::changed_map;
 use midshift_server::planning::Planning;
 use midshift_server::serve::{self, Say};
-use midshift_server::{Components, Naive, Server};
+use midshift_server::{Components, NaiveRules, Server};
 use midshift_sim::faults::FaultRates;
 use midshift_sim::fleet::{Fleet, FleetConfig, Persistence};
 use midshift_sim::service::SimFace;
@@ -129,7 +129,7 @@ async fn play(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Resul
         ota,
         reader: None,
         sim: Some(SimFace::new(hall.clone(), clock.clone(), swarm.crash())),
-        naive: Naive::default(),
+        naive: NaiveRules::default(),
         stops: Some(stops.folder.clone()),
         stop_port: Some(stops.service.address().port()),
         jumped_before: None,

@@ -14,7 +14,7 @@ use std::time::Duration;
 
 /// Naive rules of the services, for twins of tests. None by default.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Naive {
+pub struct NaiveRules {
     /// Of the link.
     pub telemetry: midshift_telemetry::Bugs,
     /// Of fleet.
@@ -25,7 +25,7 @@ pub struct Naive {
     pub rollouts: midshift_core::rollout::bugs::Bugs,
 }
 
-impl Naive {
+impl NaiveRules {
     /// Whether any naive rule of a service is compiled in. Without a test none can be switched on.
     pub const ARE_BUILT_IN: bool =
         midshift_core::task::bugs::Bugs::ARE_BUILT_IN || midshift_telemetry::Bugs::ARE_BUILT_IN;
@@ -60,7 +60,7 @@ pub struct Components {
     /// The simulator's face, if bodies live in this process.
     pub sim: Option<SimFace>,
     /// Naive rules for twins of tests; none outside them.
-    pub naive: Naive,
+    pub naive: NaiveRules,
     /// Where the stop service beside this process keeps its files, if there is one.
     pub stops: Option<PathBuf>,
     /// The port of the stop service, if it is on this host.

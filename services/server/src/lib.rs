@@ -15,7 +15,7 @@ pub mod stop_follower;
 pub mod stop_service;
 pub mod storage;
 
-pub use components::{Components, Naive};
+pub use components::{Components, NaiveRules};
 pub use server::Server;
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use crate::changed_map;
 use crate::planning::Planning;
 use crate::server::Server;
 use crate::storage::{Database, Storage};
-use crate::{Components, Naive};
+use crate::{Components, NaiveRules};
 use crate::{clock_doubt, clock_jump, stop_follower, stop_service};
 use anyhow::{Context, bail};
 use midshift_agent::tls;
@@ -224,7 +224,7 @@ async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow
         ota,
         reader,
         sim: None,
-        naive: Naive::default(),
+        naive: NaiveRules::default(),
         stops: roles.has(Role::StopFollower).then(|| args.data.join(FOLDER)),
         stop_port: beside.is_some().then(|| args.stop_listen.port()),
         port: match identity {

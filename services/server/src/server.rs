@@ -430,7 +430,7 @@ mod tests {
     mod old_connections;
 
     use super::*;
-    use crate::Naive;
+    use crate::NaiveRules;
     use crate::planning::Planning;
     use midshift_cli::roles::Roles;
     use midshift_cli::site_file;
@@ -472,7 +472,7 @@ mod tests {
             port: door::alone("business"),
             reader: None,
             sim: None,
-            naive: Naive::default(),
+            naive: NaiveRules::default(),
             stops: None,
             stop_port: None,
             jumped_before: None,

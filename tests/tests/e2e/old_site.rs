@@ -26,7 +26,7 @@ use midshift_proto::task::v1::{
 };
 use midshift_server::planning::Planning;
 use midshift_server::storage::{Database, Storage};
-use midshift_server::{Components, Naive, Server};
+use midshift_server::{Components, NaiveRules, Server};
 use midshift_store::{Query, load};
 use midshift_tests::counted::Counted;
 use midshift_tests::old_site::{DAY_MS, OldSite, task_id};
@@ -190,7 +190,7 @@ impl Serving {
             port: door::alone("business"),
             reader: None,
             sim: None,
-            naive: Naive::default(),
+            naive: NaiveRules::default(),
             stops: None,
             stop_port: None,
             jumped_before: None,

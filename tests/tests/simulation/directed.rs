@@ -482,7 +482,7 @@ fn two_planners_on_one_store_give_nothing_twice() {
     for seed in 40..43 {
         // The lease would keep one of them from planning.
         let rollouts = bugs::Bugs::seeded(&[bugs::SeededBug::EverybodyLeads]);
-        let server = midshift_server::Naive { rollouts, ..Default::default() };
+        let server = midshift_server::NaiveRules { rollouts, ..Default::default() };
         let naive = Naive { server, ..Naive::default() };
         let mut scene = Scene::with(RoomConfig { planners: 2, ..config(seed, 5, naive) });
         scene.begin("raced", GOOD[0], |_| {});

@@ -13,7 +13,7 @@ use midshift_core::rollout::rows::Phase;
 use midshift_core::update::UpdateState;
 use midshift_proto::ota::v1::RolloutSpec;
 use midshift_proto::ota::v1::rollout_wave::Size;
-use midshift_server::Naive as Server;
+use midshift_server::NaiveRules as Server;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 fn rollouts(bug: Rollouts) -> Naive {

@@ -57,7 +57,7 @@ pub struct Naive {
     /// Of every agent.
     pub agent: Bugs,
     /// Of the server.
-    pub server: midshift_server::Naive,
+    pub server: midshift_server::NaiveRules,
 }
 
 /// What a room is opened with.

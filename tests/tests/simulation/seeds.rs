@@ -5,7 +5,7 @@ use crate::run::Outcome;
 use crate::stderr::print_line;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_core::fleet::bugs::SeededBug as Fleet;
-use midshift_server::Naive as Server;
+use midshift_server::NaiveRules as Server;
 use std::collections::BTreeMap;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};

@@ -17,7 +17,7 @@ use midshift_cli::client::Exit;
 use midshift_cli::out::{Format, Out, Output};
 use midshift_dev::Dev;
 use midshift_process::logs;
-use midshift_server::Naive;
+use midshift_server::NaiveRules;
 use midshift_server::serve;
 use midshift_server::serve::Serve;
 use midshift_server::storage::Database;
@@ -26,12 +26,14 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 /// What it says of itself. A program that was built for tests has their naive rules in it and says so: none is ever released.
-const VERSION: &str =
-    if Naive::ARE_BUILT_IN || midshift_agent::bugs::Bugs::ARE_BUILT_IN || midshift_bundle::bugs::Bugs::ARE_BUILT_IN {
-        concat!(env!("CARGO_PKG_VERSION"), " with seeded bugs, for tests only")
-    } else {
-        env!("CARGO_PKG_VERSION")
-    };
+const VERSION: &str = if NaiveRules::ARE_BUILT_IN
+    || midshift_agent::bugs::Bugs::ARE_BUILT_IN
+    || midshift_bundle::bugs::Bugs::ARE_BUILT_IN
+{
+    concat!(env!("CARGO_PKG_VERSION"), " with seeded bugs, for tests only")
+} else {
+    env!("CARGO_PKG_VERSION")
+};
 
 /// A control plane for fleets of working robots. Not a safety function.
 #[derive(Parser)]
