@@ -1,4 +1,4 @@
-//! A robot's line: who comes, what it keeps, and each check-in answered after a look at the latch.
+//! Accepts the stop lines of robots, and answers each check-in after a look at the latch.
 //!
 //! Invariant: a check-in is heard only from the robot's newest line, and a generation that was not told on this line is
 //! none. A line on which nothing comes up, nothing is read or a message breaks the rules ends with a status that says so:
@@ -28,8 +28,8 @@ use std::time::Duration;
 use tonic::{Response, Status, Streaming};
 use tracing::field::Empty;
 
-/// Reads who comes, and begins the line. A robot comes by its own certificate alone.
-pub async fn attend(
+/// Accepts a line: reads the first message and begins the line. A robot is let in by its own certificate alone.
+pub async fn accept_line(
     inner: Arc<Inner>,
     by: &Caller,
     go_away: GoAwayNotice,

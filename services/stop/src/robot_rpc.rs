@@ -67,7 +67,7 @@ impl StreamingService<v1::AttendRequest> for Attend {
     fn call(&mut self, request: Request<Streaming<v1::AttendRequest>>) -> Self::Future {
         let (inner, by, go_away) = (self.0.clone(), caller(&request), GoAwayNotice::from_request(&request));
         let reporter = DenialReporter::from_request(&request);
-        Box::pin(async move { line::attend(inner, &by, go_away, &reporter, request.into_inner()).await })
+        Box::pin(async move { line::accept_line(inner, &by, go_away, &reporter, request.into_inner()).await })
     }
 }
 
