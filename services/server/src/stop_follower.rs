@@ -15,7 +15,7 @@ use midshift_core::stop::record::{StopRecord, copy};
 use midshift_core::time::{Clock, Now, Utc};
 use midshift_identity::{IdentityService, RevocationList, ServerProof};
 use midshift_stop::{Copied, Principals, Roster};
-use midshift_store::{CommitError, LeftOut, Store, follow};
+use midshift_store::{CommitError, SkippedRows, Store, follow};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
 use std::io;
@@ -46,11 +46,11 @@ pub fn tell_principals(folder: &Path, identity: &IdentityService) -> io::Result<
 }
 
 /// Stops that the store has as engaged.
-async fn engaged(store: &dyn Store, left_out: &mut LeftOut) -> anyhow::Result<Copied> {
+async fn engaged(store: &dyn Store, skipped: &mut SkippedRows) -> anyhow::Result<Copied> {
     let snapshot = store.snapshot(&[Table::StopRecord]).await.context("reading copies of stops")?;
     let mut stops = Vec::new();
     for row in &snapshot.rows {
-        let record = left_out.read::<StopRecord>(row)?.filter(StopRecord::is_effective);
+        let record = skipped.read::<StopRecord>(row)?.filter(StopRecord::is_effective);
         stops.extend(record.map(|record| record.stop));
     }
     stops.sort_unstable();
@@ -62,7 +62,7 @@ async fn engaged(store: &dyn Store, left_out: &mut LeftOut) -> anyhow::Result<Co
 /// # Errors
 /// The disk, or the store.
 pub async fn tell_stops(folder: &Path, store: &dyn Store) -> anyhow::Result<()> {
-    Ok(engaged(store, &mut LeftOut::default()).await?.write(folder)?)
+    Ok(engaged(store, &mut SkippedRows::default()).await?.write(folder)?)
 }
 
 /// The turn to follow, if nobody has it; the folder is made if it is not there.
@@ -97,7 +97,7 @@ pub struct StopFollower {
     /// A copy of what was taken back: this folder is not in the backup of the rows, and may be on another machine.
     revoked: RevocationList,
     /// Rows of a newer version, which nothing here is done by.
-    left_out: LeftOut,
+    skipped: SkippedRows,
     /// As the log was told.
     failing: bool,
 }
@@ -112,8 +112,8 @@ impl StopFollower {
     ) -> Self {
         let (copied, told, attached, gone, roster) = (None, None, None, BTreeSet::new(), None);
         let identity = identity.map(|identity| (identity, None));
-        let (left_out, revoked) = (LeftOut::default(), RevocationList::new(&folder));
-        Self { folder, store, clock, copied, told, attached, gone, roster, identity, revoked, left_out, failing: false }
+        let (skipped, revoked) = (SkippedRows::default(), RevocationList::new(&folder));
+        Self { folder, store, clock, copied, told, attached, gone, roster, identity, revoked, skipped, failing: false }
     }
 
     /// Until it is dropped.
@@ -176,7 +176,7 @@ impl StopFollower {
         if self.told.is_some() && !is_due {
             return Ok(());
         }
-        let newest = engaged(&*self.store, &mut self.left_out).await?;
+        let newest = engaged(&*self.store, &mut self.skipped).await?;
         if self.told.as_ref() == Some(&newest) && self.folder.join(Copied::NAME).exists() {
             return Ok(());
         }
@@ -221,7 +221,7 @@ impl StopFollower {
         // Copies of a newer version: that one's to write.
         let mut others = BTreeSet::new();
         for row in &snapshot.rows {
-            if let Some(record) = self.left_out.read::<StopRecord>(row)? {
+            if let Some(record) = self.skipped.read::<StopRecord>(row)? {
                 copied.insert(record.stop.stop_id.clone(), (record, row.revision));
             } else {
                 others.insert(&row.key);
@@ -245,7 +245,7 @@ impl StopFollower {
     async fn look_who_is_gone(&mut self) -> anyhow::Result<()> {
         let snapshot = self.store.snapshot(&[Table::RobotControl, Table::RobotIdentity]).await;
         let rows = snapshot.context("reading who is retired or revoked")?.rows;
-        self.gone = who_is_gone(&rows, &mut self.left_out, &self.clock.now())?;
+        self.gone = who_is_gone(&rows, &mut self.skipped, &self.clock.now())?;
         Ok(())
     }
 
@@ -308,16 +308,16 @@ fn stands_by_itself(at: Utc, now: Utc) -> bool {
 
 /// Robots that were retired, and those that were revoked and not enrolled again since: each once it stands by itself, so that a stop service that begins anew
 /// meanwhile still lists it.
-fn who_is_gone(rows: &[Row], left_out: &mut LeftOut, now: &Now) -> Result<BTreeSet<RobotId>, BadRow> {
+fn who_is_gone(rows: &[Row], skipped: &mut SkippedRows, now: &Now) -> Result<BTreeSet<RobotId>, BadRow> {
     let mut gone = BTreeSet::new();
     for row in rows {
         let (robot_id, is_gone) = match row.key.table {
             Table::RobotControl => {
-                let Some(control) = left_out.read::<RobotControl>(row)? else { continue };
+                let Some(control) = skipped.read::<RobotControl>(row)? else { continue };
                 (control.robot_id, control.retired.is_some_and(|act| stands_by_itself(act.since, now.utc)))
             }
             _ => {
-                let Some(robot) = left_out.read::<RobotIdentity>(row)? else { continue };
+                let Some(robot) = skipped.read::<RobotIdentity>(row)? else { continue };
                 let is_gone = robot.revoked.is_some_and(|act| stands_by_itself(Utc(act.at_unix_ms), now.wall));
                 (robot.robot_id, is_gone)
             }
@@ -347,7 +347,7 @@ mod tests {
             assert!(store.commit(vec![item]).await.iter().all(Result::is_ok));
             let snapshot = store.snapshot(&[Table::RobotControl, Table::RobotIdentity]).await?;
             let now = Now { utc: Utc(ms), wall: Utc(ms), ..Now::default() };
-            anyhow::Ok(who_is_gone(&snapshot.rows, &mut LeftOut::default(), &now)?)
+            anyhow::Ok(who_is_gone(&snapshot.rows, &mut SkippedRows::default(), &now)?)
         };
         assert!(gone(&robot, Expect::Absent, 50_000).await?.is_empty());
         robot.revoke("anna", Utc(5));

@@ -22,7 +22,6 @@ mod gather;
 mod group;
 mod heartbeats;
 pub mod leadership;
-mod left_out;
 mod migrations;
 mod model;
 mod model_table;
@@ -31,6 +30,7 @@ mod postgres;
 mod projection;
 mod queue;
 mod restored_rows;
+mod skipped_rows;
 mod sql;
 mod sqlite;
 mod store;
@@ -40,7 +40,6 @@ pub use frames::{
     Coarsen, FRAME_BYTES_DEFAULT, Frame, FrameLog, FrameMark, FramesOldest, GAPS_MAX, Gap, MemoryFrames, StoredFrame,
 };
 pub use heartbeats::{HeartbeatLog, MemoryHeartbeats, SavedHeartbeats, StoredHeartbeat, follow_heartbeats};
-pub use left_out::LeftOut;
 pub use migrations::Migrated;
 pub use model::MemoryStore;
 pub use open_error::OpenError;
@@ -49,6 +48,7 @@ pub use postgres::{
     RestoreError, Road, Wakes, migrate_postgres,
 };
 pub use projection::{Change, Fold, Projection};
+pub use skipped_rows::SkippedRows;
 pub use sqlite::{Database, Described, SqliteFrames, SqliteRestored, SqliteStore, migrate, renew_identity};
 pub use store::{
     Applied, Cause, CommitError, Cursor, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, ID_BYTES_MAX, Query, Retention,

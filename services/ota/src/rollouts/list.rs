@@ -14,7 +14,7 @@ use midshift_core::rollout::rows::{Rollout, RolloutRobot};
 use midshift_core::rows::{Row, Table};
 use midshift_proto::ota::v1;
 use midshift_proto::pages;
-use midshift_store::{Cursor, LeftOut, Query};
+use midshift_store::{Cursor, Query, SkippedRows};
 use std::sync::Arc;
 
 fn token(cursor: &Cursor) -> String {
@@ -68,7 +68,7 @@ impl RolloutService {
 
     /// Roll-outs that the caller may see, at most `size`, and the token of the next page; empty after the last.
     async fn page(&self, mut query: Query, size: usize, by: &Caller) -> Result<(Vec<Rollout>, String), Refusal> {
-        let (mut found, mut left_out) = (Vec::new(), LeftOut::default());
+        let (mut found, mut skipped) = (Vec::new(), SkippedRows::default());
         // One more shows whether there is another page.
         query.limit = size + 1;
         let mut last = None;
@@ -77,7 +77,7 @@ impl RolloutService {
             let is_last = rows.len() < query.limit.min(limits::PAGE_MAX);
             query.after = rows.last().map(Cursor::of_row);
             for row in rows {
-                let Some(rollout) = left_out.read::<Rollout>(&row).map_err(unread)? else { continue };
+                let Some(rollout) = skipped.read::<Rollout>(&row).map_err(unread)? else { continue };
                 if !objects::sees(by, &rollout) {
                     continue;
                 }
@@ -95,12 +95,12 @@ impl RolloutService {
 
     /// Robots of a roll-out that has ended.
     async fn counts(&self, id: &RolloutId) -> Result<Counts, Refusal> {
-        let (mut counts, mut left_out) = (Counts::default(), LeftOut::default());
+        let (mut counts, mut skipped) = (Counts::default(), SkippedRows::default());
         let mut query = Query::all(Table::RolloutRobot).of_parent(id.as_str());
         loop {
             let rows: Vec<Row> = self.store.list(query.clone()).await.map_err(unread)?;
             for row in &rows {
-                if let Some(robot) = left_out.read::<RolloutRobot>(row).map_err(unread)? {
+                if let Some(robot) = skipped.read::<RolloutRobot>(row).map_err(unread)? {
                     counts.add(&robot);
                 }
             }

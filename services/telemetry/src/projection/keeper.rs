@@ -7,7 +7,7 @@ use midshift_core::ids::{RobotId, StopId};
 use midshift_core::rows::{BadRow, Table};
 use midshift_core::site::{Site, text};
 use midshift_core::stop::record::StopRecord;
-use midshift_store::{Change, Error, Fold, LeftOut, Projection};
+use midshift_store::{Change, Error, Fold, Projection, SkippedRows};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
@@ -21,7 +21,7 @@ const MARKS_EVERY: Duration = Duration::from_secs(5);
 struct Keeper {
     inner: Arc<Inner>,
     /// Rows with a word of a newer version: what they are about gets nothing new, and everything else goes on.
-    left_out: LeftOut,
+    skipped: SkippedRows,
 }
 
 fn sections<'a>(rows: &'a mut Rows, robot_id: &RobotId) -> &'a mut Sections {
@@ -50,13 +50,13 @@ impl Fold for Keeper {
     fn apply(&mut self, change: Change) -> Result<(), BadRow> {
         if change.key.table == Table::Site {
             self.inner.projection.rows_mut().site =
-                self.left_out.read_change::<SiteRow>(&change)?.and_then(|row| map_of(&row));
+                self.skipped.read_change::<SiteRow>(&change)?.and_then(|row| map_of(&row));
             return Ok(());
         }
         let id = change.key.id.to_string();
         if change.key.table == Table::StopRecord {
             let Ok(stop_id) = StopId::parse(&id) else { return Ok(()) };
-            let record = self.left_out.read_change::<StopRecord>(&change)?.map(Arc::new);
+            let record = self.skipped.read_change::<StopRecord>(&change)?.map(Arc::new);
             set_or_remove(Arc::make_mut(&mut self.inner.projection.rows_mut().stops), stop_id, record);
             return Ok(());
         }
@@ -64,20 +64,20 @@ impl Fold for Keeper {
         let mut rows = self.inner.projection.rows_mut();
         match change.key.table {
             Table::DesiredWork => {
-                sections(&mut rows, &robot_id).work = self.left_out.read_change(&change)?.map(Arc::new)
+                sections(&mut rows, &robot_id).work = self.skipped.read_change(&change)?.map(Arc::new)
             }
             Table::DesiredPolicy => {
-                sections(&mut rows, &robot_id).policy = self.left_out.read_change(&change)?.map(Arc::new)
+                sections(&mut rows, &robot_id).policy = self.skipped.read_change(&change)?.map(Arc::new)
             }
             Table::DesiredUpdate => {
-                sections(&mut rows, &robot_id).update = self.left_out.read_change(&change)?.map(Arc::new)
+                sections(&mut rows, &robot_id).update = self.skipped.read_change(&change)?.map(Arc::new)
             }
-            Table::Session => set_or_remove(&mut rows.sessions, robot_id.clone(), self.left_out.read_change(&change)?),
+            Table::Session => set_or_remove(&mut rows.sessions, robot_id.clone(), self.skipped.read_change(&change)?),
             Table::RobotControl => {
-                set_or_remove(&mut rows.control, robot_id.clone(), self.left_out.read_change(&change)?)
+                set_or_remove(&mut rows.control, robot_id.clone(), self.skipped.read_change(&change)?)
             }
-            Table::Presence => set_or_remove(&mut rows.presence, robot_id.clone(), self.left_out.read_change(&change)?),
-            Table::LaneMark => set_or_remove(&mut rows.marks, id, self.left_out.read_change(&change)?),
+            Table::Presence => set_or_remove(&mut rows.presence, robot_id.clone(), self.skipped.read_change(&change)?),
+            Table::LaneMark => set_or_remove(&mut rows.marks, id, self.skipped.read_change(&change)?),
             _ => {}
         }
         drop(rows);
@@ -118,7 +118,7 @@ pub async fn follow_rows(inner: &Arc<Inner>) -> Result<(), Error> {
     let mut wake = inner.parts.store.wake();
     load_status(inner).await;
     let mut read_marks = Instant::now();
-    let mut projection = Projection::new(Keeper { inner: inner.clone(), left_out: LeftOut::default() });
+    let mut projection = Projection::new(Keeper { inner: inner.clone(), skipped: SkippedRows::default() });
     loop {
         wake.mark_unchanged();
         match projection.advance(inner.parts.store.as_ref()).await {

@@ -1,17 +1,17 @@
-//! Rows with a value of a newer version, for whoever only reads them: each is left out and said once, and the others are read.
+//! Skips rows with a value of a newer version, for code that only reads them: each is logged once, and the others are read.
 //!
-//! Invariant: a row that is damaged is an error. Called by folds and followers. Absent on purpose: whoever decides by such rows keeps them aside instead
+//! Invariant: a row that is damaged is an error. Called by folds and followers. Absent on purpose: code that decides by such rows keeps them aside instead
 //! (`midshift_core::unknown_rows`).
 
 use crate::Change;
 use midshift_core::rows::{BadRow, Key, Record, Row};
 use std::collections::BTreeSet;
 
-/// Rows that were left out when they were read last.
+/// The rows that were skipped when they were read last.
 #[derive(Clone, Debug, Default)]
-pub struct LeftOut(BTreeSet<Key>);
+pub struct SkippedRows(BTreeSet<Key>);
 
-impl LeftOut {
+impl SkippedRows {
     /// The record that a row holds; none: it holds a value that this build does not know.
     ///
     /// # Errors
@@ -54,12 +54,12 @@ mod tests {
 
     #[test]
     fn a_value_of_a_newer_version_is_left_out_until_it_can_be_read_and_damage_is_an_error() {
-        let mut left_out = LeftOut::default();
+        let mut skipped = SkippedRows::default();
         let mut read = |presence: &str| {
             let body = format!("{{\"robot_id\":\"r1\",\"presence\":{presence},\"since_unix_ms\":1}}");
             let key = Key::new(PresenceRow::TABLE, "r1");
             let row = Row { key, revision: Revision(1), index: Index::default(), body: body.into() };
-            left_out.read::<PresenceRow>(&row).map(|row| (row.is_some(), left_out.0.len()))
+            skipped.read::<PresenceRow>(&row).map(|row| (row.is_some(), skipped.0.len()))
         };
         assert_eq!(read("\"floating\"").ok(), Some((false, 1)));
         assert_eq!(read("\"floating\"").ok(), Some((false, 1)), "said once");
