@@ -5,7 +5,7 @@
 
 mod sessions;
 
-pub use sessions::{Condition, LaneMark, LastHeard, Live, PresenceRow, Session, SharedHeartbeat};
+pub use sessions::{ClockOffset, Condition, LaneMark, LastHeard, Live, PresenceRow, Session, SharedHeartbeat};
 
 use crate::authority::Authority;
 use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, StopId, WaypointId};

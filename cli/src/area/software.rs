@@ -198,6 +198,10 @@ mod tests {
     #[test]
     fn kept_capabilities_are_names_and_numbers() {
         assert_eq!(parse_kept_in_work("pick=3"), Ok(("pick".to_owned(), 3)));
-        assert!(parse_kept_in_work("pick").is_err() && parse_kept_in_work("=3").is_err() && parse_kept_in_work("pick=some").is_err());
+        assert!(
+            parse_kept_in_work("pick").is_err()
+                && parse_kept_in_work("=3").is_err()
+                && parse_kept_in_work("pick=some").is_err()
+        );
     }
 }

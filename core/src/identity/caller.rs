@@ -29,7 +29,7 @@ pub enum Principal {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Caller {
     principal: Principal,
-    grants: Arc<[Grant]>,
+    grants: Arc<[HeldGrant]>,
     /// Its token's time is over, for less than [`crate::limits::TOKEN_STOPS_AFTER_EXPIRY`]: it may engage stops and nothing else.
     expired: bool,
     certificate: Option<Arc<str>>,
@@ -64,7 +64,7 @@ impl Caller {
         Self { key: Some(key), ..self }
     }
     /// The holder of a token; of one that is `expired`, it may still engage stops.
-    pub fn holder(token: TokenId, name: Arc<str>, grants: Arc<[Grant]>, expired: bool) -> Self {
+    pub fn holder(token: TokenId, name: Arc<str>, grants: Arc<[HeldGrant]>, expired: bool) -> Self {
         Self { grants, expired, ..Self::without_grants(Principal::Holder { token, name }) }
     }
     /// The same as one person's, who may have several tokens. None: its name stands for itself.
@@ -119,7 +119,7 @@ impl Caller {
             (Principal::Holder { .. }, _) if self.expired => {
                 return Err(Refusal::new(Kind::Unauthenticated, Code::TokenExpired));
             }
-            (Principal::Holder { .. }, needed) => self.grants.iter().any(|grant| {
+            (Principal::Holder { .. }, needed) => self.known_grants().any(|grant| {
                 grant.role.permits(needed) && (access.object != super::Object::Site || grant.scope == Scope::Site)
             }),
         };

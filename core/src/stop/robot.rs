@@ -113,7 +113,8 @@ impl RobotStop {
     pub fn merge_relayed(&mut self, stops: Vec<Stop>, resets: Vec<Reset>, is_marked: impl Fn(&Reset) -> bool) -> bool {
         let engaged = self.merge_changes(stops, Vec::new());
         let latch = &self.saved.latch;
-        let is_older = |reset: &Reset| latch.stop(&reset.stop_id).is_some_and(|stop| reset.at < stop.engaged);
+        let is_older =
+            |reset: &Reset| latch.stop(&reset.stop_id).is_some_and(|stop| reset.reset_unix_ms < stop.engaged_unix_ms);
         let counts = |reset: &Reset| latch.reset_of(&reset.stop_id).is_none() && !is_older(reset) && is_marked(reset);
         let resets: Vec<Reset> = resets.into_iter().filter(counts).collect();
         self.merge_changes(Vec::new(), resets) || engaged
@@ -246,7 +247,7 @@ mod tests {
         assert!(robot.merge_relayed(vec![stop(1, StopLevel::Halt)], vec![], |_| true));
         assert!(!robot.merge_relayed(vec![stop(1, StopLevel::Halt)], vec![], |_| true), "twice is once");
         assert_eq!(robot.advance(&at(3_100), None, Around::Robots).level, StopLevel::Halt);
-        let older = Reset { at: Utc(0), ..reset(1) };
+        let older = Reset { reset_unix_ms: Utc(0), ..reset(1) };
         assert!(!robot.merge_relayed(vec![], vec![reset(1)], |_| false), "not marked");
         assert!(!robot.merge_relayed(vec![], vec![older], |_| true), "older than its stop");
         assert!(!robot.merge_relayed(vec![], vec![], |_| true), "absence");

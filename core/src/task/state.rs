@@ -308,7 +308,7 @@ pub struct Attempt {
     pub software: String,
     /// Where the robot was while it had it. None: it is an errand, an older version began it, or a part of it was lost or cannot be compared.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub been: Option<VisitedPlaces>,
+    pub visited: Option<VisitedPlaces>,
 }
 
 impl Attempt {

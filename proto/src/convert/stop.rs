@@ -1,7 +1,6 @@
 //! Stops, resets and what a robot says of them.
 
 use super::{At, Parse, WireEnum, counted, id, list, need, text, word};
-use crate::link::v1 as link;
 use crate::session::StopFacts;
 use crate::stop::v1;
 use midshift_core::ids::{AreaId, PlaceId, RobotId, StopId};

@@ -182,7 +182,9 @@ impl Line {
             }
             LineEvent::Heard(None) => self.lost("the line ended"),
             LineEvent::Heard(Some(message)) => match parse(*message) {
-                Ok(FromStop::Told { stops, resets, generation }) => Some(StopNews::Told { stops, resets, generation }),
+                Ok(FromStop::Facts { stops, resets, generation }) => {
+                    Some(StopNews::Facts { stops, resets, generation })
+                }
                 Ok(FromStop::Synced { generation, key }) => {
                     self.failures = 0;
                     self.refused.forget();

@@ -149,7 +149,7 @@ impl StopState {
                     said: None,
                 });
             }
-            StopNews::Told { stops, resets, generation } => {
+            StopNews::Facts { stops, resets, generation } => {
                 let is_changed = self.robot.merge_changes(stops, resets);
                 self.changed(is_changed);
                 // Before all was said, one part of it is no state of the latch.

@@ -95,7 +95,7 @@ fn before_the_stop_service_has_said_its_key_no_reset_on_the_link_counts() {
     says(&mut rig, vec![], vec![marked(reset(1), &service())]);
     assert!(is_stopped(&rig));
     // On its own line it needs no mark.
-    hear_news(&mut rig, StopNews::Told { stops: vec![], resets: vec![reset(1)], generation: 11 });
+    hear_news(&mut rig, StopNews::Facts { stops: vec![], resets: vec![reset(1)], generation: 11 });
     assert_eq!(rig.core.known_stops().count(), 0);
 }
 

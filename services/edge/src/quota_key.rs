@@ -24,7 +24,7 @@ pub(crate) enum QuotaKey {
 
 impl QuotaKey {
     pub fn from_caller(caller: Result<&Caller, &Refusal>, address: IpAddr) -> Self {
-        match caller.map(Caller::who) {
+        match caller.map(Caller::principal) {
             Ok(Principal::Robot(robot_id)) => Self::Robot(robot_id.clone()),
             Ok(Principal::Holder { token, .. }) => Self::Token(token.clone()),
             Ok(Principal::Local) => Self::Network(network(address)),

@@ -11,6 +11,7 @@ const WORDS: &[(&str, &[&str])] = &[
         "aside",
         &[
             "AfterStopping",
+            "Ask",
             "AttemptPhase",
             "DrainState",
             "Duty",

@@ -107,7 +107,7 @@ pub fn apply_attempt_report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptRep
 
 /// Notes the load that a robot says it carries: an item of the task it works on opens that task, whatever else it says.
 pub fn note_load(tx: &mut Tx, robot_id: &RobotId, load: &Load) {
-    let task = load.task_id.as_ref().and_then(|id| tx.view.task(id)).filter(|t| t.opened.is_none());
+    let task = load.task_id.as_ref().and_then(|id| tx.view.task(id)).filter(|t| t.opened_robot_id.is_none());
     let attempt = task.and_then(|t| t.attempt_id()).filter(|id| tx.view.held_by(robot_id) == Some(id));
     let Some((mut task, id)) = task.cloned().zip(attempt) else { return };
     task.opened_robot_id = Some(robot_id.clone());

@@ -44,7 +44,7 @@ pub fn fresh_attempt(tx: &Tx, attempt: AttemptId, robot_id: &RobotId, offer: cra
     let session = tx.view.sessions.get(robot_id.as_str()).map(|s| &s.row);
     let software = session.map(|s| s.inventory.software.clone()).unwrap_or_default();
     let of_task = session.filter(|_| attempt.subject.task_id().is_some());
-    let been = of_task.map(|s| VisitedPlaces { ring: s.ring.clone(), ..VisitedPlaces::default() });
+    let visited = of_task.map(|s| VisitedPlaces { ring: s.ring.clone(), ..VisitedPlaces::default() });
     Attempt {
         attempt,
         robot_id: robot_id.clone(),

@@ -44,5 +44,5 @@ fn a_robot_that_carries_an_item_of_its_task_has_opened_it() {
     assert_eq!((rig.task("T1").robot_id.as_ref(), &rig.task("T1").opened_robot_id), (Some(&robot_id), &None));
     let (now, load) = (rig.now, Load { task_id: Some(task_id), item: "box".to_owned() });
     Plan::default().decide(&mut rig.view, now, "fleet", |tx| inbox::note_load(tx, &robot_id, &load));
-    assert_eq!(rig.task("T1").opened, Some(robot_id));
+    assert_eq!(rig.task("T1").opened_robot_id, Some(robot_id));
 }

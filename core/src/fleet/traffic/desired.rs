@@ -16,7 +16,7 @@ use crate::ids::{AttemptId, RobotId};
 use crate::limits;
 use crate::robot::ReportedAttempt;
 use crate::task::{AfterStopping, Attempt, AttemptPhase};
-use crate::work::{Assignment, DesiredPolicy, DesiredWork, GrantedPlace, Live, RoutePoint, WorkState};
+use crate::work::{AreaRules, Assignment, DesiredPolicy, DesiredWork, GrantedPlace, Live, RoutePoint, WorkState};
 use std::collections::BTreeMap;
 
 /// What a robot may do from this cycle on; `desired` writes it down.

@@ -208,7 +208,7 @@ impl AgentCore {
 
     fn open(&self, desired: &DesiredUpdate, now: Utc) -> Result<Directive, Reason> {
         let bugs = self.config.bugs;
-        let newest = if bugs.replays_are_taken() { 0 } else { self.memory.ledger.software.directive };
+        let newest = if bugs.replays_are_taken() { 0 } else { self.memory.ledger.software.directive_generation };
         let directive = self.opened(desired, newest, now).map_err(|rejection| refusal_of(&rejection))?;
         if self.lists(&directive.manifest, directive.manifest_length) || bugs.unlisted_is_fine() {
             Ok(directive)

@@ -92,7 +92,7 @@ impl AgentCore {
 
     /// A directive was taken by an agent that keeps documents.
     pub(super) fn note_directive(&mut self, generation: u64) {
-        if self.memory.ledger.proven.as_ref().map_or(0, |proven| proven.directive) != generation {
+        if self.memory.ledger.proven.as_ref().map_or(0, |proven| proven.directive_generation) != generation {
             let proven = self.proven();
             self.put_proven(Proven { directive_generation: generation, ..proven });
         }
@@ -104,8 +104,8 @@ impl AgentCore {
         let software = &self.memory.ledger.software;
         let update = software.update.as_ref();
         let is_older = match &self.memory.ledger.proven {
-            Some(proven) => software.directive > proven.directive,
-            None => software.directive > 0 || update.is_some(),
+            Some(proven) => software.directive_generation > proven.directive_generation,
+            None => software.directive_generation > 0 || update.is_some(),
         };
         let set = update.and_then(|u| u.set.clone());
         let mut proven = self.proven();

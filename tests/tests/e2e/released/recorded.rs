@@ -7,7 +7,7 @@ use super::{Engine, all, database};
 use anyhow::{Context, ensure};
 use midshift_core::site::{DEMO, text};
 use midshift_store::{
-    FRAME_BYTES_DEFAULT, HeardLog, PostgresConfig, PostgresFrames, PostgresHeard, PostgresStore, SqliteFrames,
+    FRAME_BYTES_DEFAULT, HeartbeatLog, PostgresConfig, PostgresFrames, PostgresHeartbeats, PostgresStore, SqliteFrames,
     SqliteStore,
 };
 use std::path::Path;
@@ -34,8 +34,8 @@ async fn read(data: &Path, database: Option<&str>) -> anyhow::Result<Found> {
     let config = PostgresConfig::new(url);
     let store = PostgresStore::open(&config, site_id.clone(), clock.clone()).await?;
     let frames = PostgresFrames::open(&config, site_id.clone(), clock, FRAME_BYTES_DEFAULT).await?;
-    let heard = PostgresHeard::open(&config, site_id).await?;
-    let found = rows::read(&store, &frames, Some(&heard as &dyn HeardLog)).await?;
+    let heard = PostgresHeartbeats::open(&config, site_id).await?;
+    let found = rows::read(&store, &frames, Some(&heard as &dyn HeartbeatLog)).await?;
     store.close().await;
     frames.close().await;
     heard.close().await;

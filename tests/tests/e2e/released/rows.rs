@@ -6,11 +6,11 @@
 use anyhow::{Context, ensure};
 use midshift_core::idempotency::CommandKey;
 use midshift_core::rows::{Entry, Key, Log, Record, Revision, Row, Seq, Table};
-use midshift_core::work::{InboxEntry, Told};
+use midshift_core::work::{InboxEntry, SharedHeartbeat};
 use midshift_core::{audit, fleet, identity, leadership, maintenance, policy, rollout, stop, task, update, work};
 use midshift_proto::link::v1::LaneBatch;
 use midshift_proto::{parse, session};
-use midshift_store::{FrameLog, HeardLog, Store, follow};
+use midshift_store::{FrameLog, HeartbeatLog, Store, follow};
 use prost::Message;
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -29,7 +29,7 @@ impl Found {
 }
 
 /// Reads all of it; the first row that cannot be read, or would lose something, is an error.
-pub async fn read(store: &dyn Store, frames: &dyn FrameLog, heard: Option<&dyn HeardLog>) -> anyhow::Result<Found> {
+pub async fn read(store: &dyn Store, frames: &dyn FrameLog, heard: Option<&dyn HeartbeatLog>) -> anyhow::Result<Found> {
     let names = Table::ALL.iter().map(|table| table.name()).chain(Log::ALL.iter().map(|log| log.name()));
     let mut found = Found(names.chain(["frame_log", "robot_last"]).map(|name| (name, 0)).collect());
     for row in store.snapshot(Table::ALL).await?.rows {
@@ -52,7 +52,7 @@ pub async fn read(store: &dyn Store, frames: &dyn FrameLog, heard: Option<&dyn H
     if let Some(heard) = heard {
         for newest in heard.read(0).await?.0 {
             found.count("robot_last");
-            keeps(&newest.body, &Told::parse(&newest.body)?.text())?;
+            keeps(&newest.body, &SharedHeartbeat::parse(&newest.body)?.text())?;
         }
     }
     Ok(found)
