@@ -118,7 +118,7 @@ pub struct Latch {
     stops: BTreeMap<StopId, Stop>,
     resets: BTreeMap<StopId, Reset>,
     /// When the newest of those was engaged that were forgotten with their reset; 0: none was.
-    #[serde(default, skip_serializing_if = "is_never")]
+    #[serde(rename = "forgotten_unix_ms", default, skip_serializing_if = "is_never")]
     forgotten: Utc,
 }
 

@@ -420,7 +420,7 @@ mod tests {
     #[test]
     fn who_is_known_is_said_to_be_so_still_without_being_written_anew() -> io::Result<()> {
         let folder = tempfile::tempdir()?;
-        assert!(Principals::affirm(folder.path()).is_err() && Principals::told(folder.path()).is_none());
+        assert!(Principals::affirm(folder.path()).is_err() && Principals::written_at(folder.path()).is_none());
         let principals = Principals {
             directory: Default::default(),
             chain_pem: "chain".to_owned(),
@@ -430,9 +430,9 @@ mod tests {
         principals.write(folder.path())?;
         let path = folder.path().join(Principals::NAME);
         File::options().write(true).open(&path)?.set_modified(std::time::UNIX_EPOCH)?;
-        assert_eq!(Principals::told(folder.path()).map(|at| at.0), Some(0));
+        assert_eq!(Principals::written_at(folder.path()).map(|at| at.0), Some(0));
         Principals::affirm(folder.path())?;
-        assert!(Principals::told(folder.path()).is_some_and(|at| at.0 > 1_700_000_000_000));
+        assert!(Principals::written_at(folder.path()).is_some_and(|at| at.0 > 1_700_000_000_000));
         assert!(Principals::read(folder.path())?.is_some_and(|read| read == principals));
         Ok(())
     }

@@ -56,7 +56,7 @@ pub async fn run(args: &OtaArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figur
 }
 
 /// Reports the result of one run: all of them together take minutes.
-fn told<T: std::fmt::Debug>(run: T, say: &dyn Fn(&str)) -> T {
+fn report_run<T: std::fmt::Debug>(run: T, say: &dyn Fn(&str)) -> T {
     say(&format!("{run:?}"));
     run
 }
