@@ -350,9 +350,9 @@ impl BadRow {
     }
 }
 
-/// Rows that a reading begins with.
+/// Selects rows with which a reading of the store begins.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Part {
+pub enum RowSelection {
     /// A table whole: it holds only what is alive, or is bounded by count.
     Whole(Table),
     /// Rows of a table in one of these states, by its index of states.

@@ -4,7 +4,7 @@
 
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Item, Key, Log, Naming, Part, Row, Seq, Writer};
+use midshift_core::rows::{Item, Key, Log, Naming, Row, RowSelection, Seq, Writer};
 use midshift_store::{Applied, CommitError, Error, FeedPage, Query, Retention, Snapshot, Store, StoreId};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -53,7 +53,7 @@ impl Store for Counted {
     async fn list(&self, query: Query) -> Result<Vec<Row>, Error> {
         self.count(self.store.list(query).await, Vec::len)
     }
-    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
+    async fn read(&self, parts: &[RowSelection], named: Naming) -> Result<Snapshot, Error> {
         self.count(self.store.read(parts, named).await, |snapshot| snapshot.rows.len())
     }
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {

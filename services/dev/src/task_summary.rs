@@ -5,7 +5,7 @@
 //! Called by `dev`, for its client and its report.
 
 use midshift_core::ids::TaskId;
-use midshift_core::rows::{BadRow, Key, Log, Part, Row, Seq, Table};
+use midshift_core::rows::{BadRow, Key, Log, Row, RowSelection, Seq, Table};
 use midshift_core::task::{Phase, TaskIntake, TaskState};
 use midshift_core::time::Utc;
 use midshift_store::{Cursor, Error, FEED_PAGE_MAX, Query, Store};
@@ -124,7 +124,7 @@ pub async fn newest_number(store: &dyn Store) -> Result<u64, Error> {
 /// Returns where the feed goes on.
 async fn read_rows(store: &dyn Store, tasks: &SharedTasks) -> Result<Seq, Error> {
     let live = Phase::ALL.into_iter().filter(|phase| !phase.is_terminal()).map(Phase::number).collect();
-    let alive = store.read(&[Part::InStates(Table::TaskState, live)], |_| Vec::new()).await?;
+    let alive = store.read(&[RowSelection::InStates(Table::TaskState, live)], |_| Vec::new()).await?;
     let (run, before) = read_tasks(tasks, |tasks| (tasks.run.clone(), tasks.before));
     let mut fresh = Tasks::of_run(&run, before);
     for row in &alive.rows {

@@ -13,7 +13,7 @@ use midshift_core::fleet::rows::RobotCounter;
 use midshift_core::ids::{AttemptId, Subject};
 use midshift_core::limits;
 use midshift_core::privacy;
-use midshift_core::rows::{Item, Key, Part, Row, Table, Writer};
+use midshift_core::rows::{Item, Key, Row, RowSelection, Table, Writer};
 use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskState};
 use midshift_core::time::{Clock, Utc};
 use midshift_store::{Cursor, Error, Query, Store, expired_rows, load};
@@ -52,7 +52,7 @@ async fn prune_commands(store: &dyn Store, wall: Utc) -> Result<u64, Error> {
 /// What a live task waits for, and what holds a robot.
 async fn named(store: &dyn Store) -> Result<BTreeSet<Key>, Error> {
     let live = Phase::ALL.into_iter().filter(|p| !p.is_terminal()).map(Phase::number);
-    let parts = [Part::InStates(Table::TaskState, live.collect()), Part::Whole(Table::RobotAuthority)];
+    let parts = [RowSelection::InStates(Table::TaskState, live.collect()), RowSelection::Whole(Table::RobotAuthority)];
     Ok(store.read(&parts, projection::named).await?.rows.into_iter().map(|row| row.key).collect())
 }
 

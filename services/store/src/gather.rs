@@ -3,7 +3,7 @@
 //! Invariant: no key is read twice, however often it is named. Called by each engine, within the one moment that it reads.
 
 use crate::Snapshot;
-use midshift_core::rows::{Key, Naming, Part, Row, Seq, Table};
+use midshift_core::rows::{Key, Naming, Row, RowSelection, Seq, Table};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -25,13 +25,13 @@ pub(crate) struct Gathered {
 
 impl Gathered {
     /// Takes of `parts` what is asked by key or by parent.
-    pub(crate) fn new(parts: &[Part], named: Naming) -> Self {
+    pub(crate) fn new(parts: &[RowSelection], named: Naming) -> Self {
         let (mut wanted, mut of_parents) = (Vec::new(), Vec::new());
         for part in parts {
             match part {
-                Part::Rows(keys) => wanted.extend(keys.iter().cloned()),
-                Part::OfParents { table, parents } => of_parents.push((*table, *parents)),
-                Part::Whole(_) | Part::InStates(..) => {}
+                RowSelection::Rows(keys) => wanted.extend(keys.iter().cloned()),
+                RowSelection::OfParents { table, parents } => of_parents.push((*table, *parents)),
+                RowSelection::Whole(_) | RowSelection::InStates(..) => {}
             }
         }
         Self { named, rows: Vec::new(), known: BTreeSet::new(), asked: 0, wanted, of_parents, parented: 0 }

@@ -15,7 +15,7 @@ use crate::{
 use async_trait::async_trait;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Item, Key, Log, Naming, Part, Row, Seq, Table, Writer};
+use midshift_core::rows::{Entry, Item, Key, Log, Naming, Row, RowSelection, Seq, Table, Writer};
 use midshift_core::time::Clock;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -189,16 +189,18 @@ impl Store for MemoryStore {
         Ok(self.state().tables.get(&query.table).map_or_else(Vec::new, |rows| rows.list(&query)))
     }
 
-    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
+    async fn read(&self, parts: &[RowSelection], named: Naming) -> Result<Snapshot, Error> {
         let state = self.state();
         let mut gathered = Gathered::new(parts, named);
         for part in parts {
             match part {
-                Part::Whole(table) => gathered.add(state.tables.get(table).into_iter().flat_map(Rows::iter).cloned()),
-                Part::InStates(table, states) => {
+                RowSelection::Whole(table) => {
+                    gathered.add(state.tables.get(table).into_iter().flat_map(Rows::iter).cloned())
+                }
+                RowSelection::InStates(table, states) => {
                     gathered.add(state.tables.get(table).into_iter().flat_map(|rows| rows.in_states(states)).cloned());
                 }
-                Part::Rows(_) | Part::OfParents { .. } => {}
+                RowSelection::Rows(_) | RowSelection::OfParents { .. } => {}
             }
         }
         loop {

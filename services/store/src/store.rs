@@ -4,7 +4,9 @@ use async_trait::async_trait;
 use midshift_core::audit::Head;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::limits;
-use midshift_core::rows::{BadRow, Entry, Item, Key, Log, Naming, Part, Record, Revision, Row, Seq, Table, Writer};
+use midshift_core::rows::{
+    BadRow, Entry, Item, Key, Log, Naming, Record, Revision, Row, RowSelection, Seq, Table, Writer,
+};
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
@@ -270,10 +272,10 @@ pub trait Store: Send + Sync + 'static {
     /// One page of a table.
     async fn list(&self, query: Query) -> Result<Vec<Row>, Error>;
     /// Rows of `parts`, and those that they name, all at one moment. Costs what these rows cost, whatever else the tables hold.
-    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error>;
+    async fn read(&self, parts: &[RowSelection], named: Naming) -> Result<Snapshot, Error>;
     /// Tables whole, at one moment: of tables that are small.
     async fn snapshot(&self, tables: &[Table]) -> Result<Snapshot, Error> {
-        let parts: Vec<Part> = tables.iter().map(|table| Part::Whole(*table)).collect();
+        let parts: Vec<RowSelection> = tables.iter().map(|table| RowSelection::Whole(*table)).collect();
         self.read(&parts, |_| Vec::new()).await
     }
     /// Entries of `logs` after a cursor, in commit order, without holes.

@@ -8,7 +8,7 @@ use midshift_agent::memory::MemoryStore as RobotMemoryStore;
 use midshift_agent::store::{Error as RobotError, Op, RobotMemory, Store as RobotStore};
 use midshift_core::audit::Head;
 use midshift_core::ids::{RobotId, SiteId};
-use midshift_core::rows::{Item, Key, Log, Naming, Part, Row, Seq, Writer};
+use midshift_core::rows::{Item, Key, Log, Naming, Row, RowSelection, Seq, Writer};
 use midshift_store::{
     Applied, Cause, Coarsen, CommitError, Error, FeedPage, Frame, FrameLog, FrameMark, FramesOldest, Gap, MemoryFrames,
     MemoryStore, Query, Retention, Snapshot, Store, StoreId, StoredFrame,
@@ -141,7 +141,7 @@ impl Store for ServerDisk {
         self.readable()?;
         self.inner.list(query).await
     }
-    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
+    async fn read(&self, parts: &[RowSelection], named: Naming) -> Result<Snapshot, Error> {
         self.readable()?;
         self.inner.read(parts, named).await
     }

@@ -9,16 +9,18 @@ use super::rows::{RobotAuthority, RobotHolder};
 use super::state::FleetProjection;
 use crate::ids::TaskId;
 use crate::limits;
-use crate::rows::{BadRow, Key, Part, Revision, Row, Seq, Table};
+use crate::rows::{BadRow, Key, Revision, Row, RowSelection, Seq, Table};
 use crate::task::{AttemptPhase, Phase, TaskIntake, TaskState};
 
 /// What the projection begins with: all that is alive. [`named`] says what is read with it.
-pub fn alive() -> Vec<Part> {
+pub fn alive() -> Vec<RowSelection> {
     let tasks = Phase::ALL.into_iter().filter(|p| !p.is_terminal()).map(Phase::number);
     let attempts = AttemptPhase::ALL.into_iter().filter(|p| !p.is_terminal()).map(AttemptPhase::number);
-    let in_states =
-        [Part::InStates(Table::TaskState, tasks.collect()), Part::InStates(Table::Attempt, attempts.collect())];
-    FleetProjection::WHOLE.iter().map(|table| Part::Whole(*table)).chain(in_states).collect()
+    let in_states = [
+        RowSelection::InStates(Table::TaskState, tasks.collect()),
+        RowSelection::InStates(Table::Attempt, attempts.collect()),
+    ];
+    FleetProjection::WHOLE.iter().map(|table| RowSelection::Whole(*table)).chain(in_states).collect()
 }
 
 /// What rows of the projection name: of a task that has not ended what was asked for, its newest attempt, and the tasks

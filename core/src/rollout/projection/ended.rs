@@ -8,7 +8,7 @@ use super::rows::{AreaBundle, Phase, Rollout, RolloutRobot, Step};
 use super::state::RolloutProjection;
 use crate::ids::RolloutId;
 use crate::projection::Projected;
-use crate::rows::{BadRow, Entry, Key, Part, Record, Revision, Row, Table};
+use crate::rows::{BadRow, Entry, Key, Record, Revision, Row, RowSelection, Table};
 use std::collections::BTreeSet;
 
 /// Phases of roll-outs that have ended, by number.
@@ -21,24 +21,24 @@ fn open_phases() -> Vec<i64> {
 }
 
 /// Robots of each roll-out that is read.
-pub const fn robots() -> Part {
-    Part::OfParents { table: Table::RolloutRobot, parents: Table::Rollout }
+pub const fn robots() -> RowSelection {
+    RowSelection::OfParents { table: Table::RolloutRobot, parents: Table::Rollout }
 }
 
 /// What names roll-outs: those that have not ended, robots for which something is still due, and what newcomers get.
 /// With [`named`], and without robots of whole roll-outs, these are the ones that must stay.
-pub fn naming() -> Vec<Part> {
+pub fn naming() -> Vec<RowSelection> {
     let steps = Step::ALL.into_iter().filter(|step| !step.is_over()).map(Step::number).collect();
     vec![
-        Part::InStates(Table::Rollout, open_phases()),
-        Part::InStates(Table::RolloutRobot, steps),
-        Part::Whole(Table::AreaBundle),
+        RowSelection::InStates(Table::Rollout, open_phases()),
+        RowSelection::InStates(Table::RolloutRobot, steps),
+        RowSelection::Whole(Table::AreaBundle),
     ]
 }
 
 /// What the projection begins with. [`named`] says what is read with it.
-pub fn alive() -> Vec<Part> {
-    RolloutProjection::WHOLE.iter().map(|table| Part::Whole(*table)).chain(naming()).chain([robots()]).collect()
+pub fn alive() -> Vec<RowSelection> {
+    RolloutProjection::WHOLE.iter().map(|table| RowSelection::Whole(*table)).chain(naming()).chain([robots()]).collect()
 }
 
 /// What rows of the projection name: the roll-out of a robot for which something is due, the one that another takes back,

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::rollout::projection::ended;
-use crate::rows::Part;
+use crate::rows::RowSelection;
 
 /// Rows of a roll-out, as whoever asks for it reads them.
 fn read(rig: &Rig, id: &str) -> Vec<Row> {
@@ -92,7 +92,7 @@ fn a_reading_begins_with_what_is_alive_and_names_the_rest() {
     let rows: Vec<Row> = rig.rows.values().cloned().collect();
     assert!(ended::named(&rows).is_empty(), "of what ended nothing");
     let parts = ended::alive();
-    assert!(parts.iter().all(|part| !matches!(part, Part::Whole(Table::Rollout | Table::RolloutRobot))));
+    assert!(parts.iter().all(|part| !matches!(part, RowSelection::Whole(Table::Rollout | Table::RolloutRobot))));
     let mut open = rig.robot_in("ro", 1);
     open.step = Step::Stuck;
     let row = Row { key: open.key(), revision: Revision(1), index: open.index(), body: open.body() };

@@ -7,7 +7,7 @@ use super::reconcile::Loop;
 use super::requests::Request;
 use midshift_core::ids::RolloutId;
 use midshift_core::rollout::ended;
-use midshift_core::rows::{Key, Part, Table};
+use midshift_core::rows::{Key, RowSelection, Table};
 use midshift_store::Error;
 use std::collections::BTreeSet;
 
@@ -43,7 +43,7 @@ impl Loop {
         if keys.is_empty() {
             return Ok(());
         }
-        let snapshot = self.parts.store.read(&[Part::Rows(keys), ended::robots()], ended::named).await?;
+        let snapshot = self.parts.store.read(&[RowSelection::Rows(keys), ended::robots()], ended::named).await?;
         Ok(self.view.absorb_past(named, &snapshot.rows)?)
     }
 }

@@ -32,7 +32,7 @@ use connect::{CONTROL_SCHEMA, Database, TELEMETRY_SCHEMA, patiently};
 use midshift_core::Boxed;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Item, Key, Log, Naming, Part, Row, Seq, Writer as Author};
+use midshift_core::rows::{Item, Key, Log, Naming, Row, RowSelection, Seq, Writer as Author};
 use midshift_core::time::Clock;
 use sqlx::PgPool;
 use std::collections::{BTreeMap, BTreeSet};
@@ -155,7 +155,7 @@ impl Store for PostgresStore {
         patiently(async { read::list(&self.readers, &self.site_id, &query).await.map_err(unavailable) }).await
     }
 
-    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
+    async fn read(&self, parts: &[RowSelection], named: Naming) -> Result<Snapshot, Error> {
         patiently(async { read::read(&self.readers, &self.site_id, parts, named).await.map_err(unavailable) }).await
     }
 

@@ -11,7 +11,7 @@ use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
 use crate::store::page_of;
 use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Snapshot};
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Key, Log, Naming, Part, Row, Seq, Table};
+use midshift_core::rows::{Entry, Key, Log, Naming, Row, RowSelection, Seq, Table};
 use sqlx::postgres::PgRow;
 use sqlx::{AssertSqlSafe, PgConnection, PgPool, Postgres, Row as _, Transaction};
 use std::collections::{BTreeMap, BTreeSet};
@@ -101,7 +101,7 @@ async fn list_one(
 pub(super) async fn read(
     readers: &PgPool,
     site_id: &SiteId,
-    parts: &[Part],
+    parts: &[RowSelection],
     named: Naming,
 ) -> Result<Snapshot, sqlx::Error> {
     let mut transaction = begin(readers).await?;
@@ -109,12 +109,14 @@ pub(super) async fn read(
     let mut gathered = Gathered::new(parts, named);
     for part in parts {
         let (table, selects) = match part {
-            Part::Whole(table) => (*table, vec![sqlx::query(AssertSqlSafe(sql::whole(*table))).bind(site_id.as_str())]),
-            Part::InStates(table, states) => {
+            RowSelection::Whole(table) => {
+                (*table, vec![sqlx::query(AssertSqlSafe(sql::whole(*table))).bind(site_id.as_str())])
+            }
+            RowSelection::InStates(table, states) => {
                 let select = || sqlx::query(AssertSqlSafe(sql::in_state(*table))).bind(site_id.as_str());
                 (*table, states.iter().map(|state| select().bind(*state)).collect())
             }
-            Part::Rows(_) | Part::OfParents { .. } => continue,
+            RowSelection::Rows(_) | RowSelection::OfParents { .. } => continue,
         };
         for select in selects {
             gathered.add(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);

@@ -28,7 +28,7 @@ use file::{CONTROL_DB, DataFile, TELEMETRY_DB};
 use midshift_core::Boxed;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Item, Key, Log, Naming, Part, Row, Seq, Writer as Author};
+use midshift_core::rows::{Entry, Item, Key, Log, Naming, Row, RowSelection, Seq, Writer as Author};
 use midshift_core::time::Clock;
 use sqlx::SqlitePool;
 use std::collections::{BTreeMap, BTreeSet};
@@ -143,7 +143,7 @@ impl Store for SqliteStore {
         read::list(&self.readers, &self.site_id, &query).await.map_err(unavailable)
     }
 
-    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
+    async fn read(&self, parts: &[RowSelection], named: Naming) -> Result<Snapshot, Error> {
         read::read(&self.readers, &self.site_id, parts, named).await.map_err(unavailable)
     }
 

@@ -11,7 +11,7 @@ use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
 use crate::store::page_of;
 use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot};
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Key, Log, Naming, Part, Row, Seq, Table};
+use midshift_core::rows::{Entry, Key, Log, Naming, Row, RowSelection, Seq, Table};
 use sqlx::sqlite::{SqliteArguments, SqliteRow};
 use sqlx::{AssertSqlSafe, Row as _, Sqlite, SqliteConnection, SqlitePool};
 use std::collections::{BTreeMap, BTreeSet};
@@ -108,7 +108,7 @@ async fn list_one(
 pub(super) async fn read(
     readers: &SqlitePool,
     site_id: &SiteId,
-    parts: &[Part],
+    parts: &[RowSelection],
     named: Naming,
 ) -> Result<Snapshot, sqlx::Error> {
     let mut transaction = readers.begin().await?;
@@ -116,12 +116,12 @@ pub(super) async fn read(
     let mut gathered = Gathered::new(parts, named);
     for part in parts {
         let (table, selects) = match part {
-            Part::Whole(table) => (*table, vec![prepared(sql::whole(*table)).bind(site_id.as_str())]),
-            Part::InStates(table, states) => {
+            RowSelection::Whole(table) => (*table, vec![prepared(sql::whole(*table)).bind(site_id.as_str())]),
+            RowSelection::InStates(table, states) => {
                 let one = |state: &i64| prepared(sql::in_state(*table)).bind(site_id.as_str()).bind(*state);
                 (*table, states.iter().map(one).collect())
             }
-            Part::Rows(_) | Part::OfParents { .. } => continue,
+            RowSelection::Rows(_) | RowSelection::OfParents { .. } => continue,
         };
         for select in selects {
             gathered.add(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);

@@ -2,7 +2,7 @@
 
 use crate::support::{WALL, at, indexed, item, one, put};
 use midshift_core::rows::{
-    Expect, Fact, Index, Item, Key, Log, Naming, Part, Revision, Row, RowChange, Seq, Table, Write, Writer,
+    Expect, Fact, Index, Item, Key, Log, Naming, Revision, Row, RowChange, RowSelection, Seq, Table, Write, Writer,
 };
 use midshift_store::{CommitError, Cursor, Error, Query, Retention, Store};
 use std::collections::BTreeSet;
@@ -280,7 +280,11 @@ async fn a_reading_holds_its_parts_and_what_they_name_and_nothing_else(store: Ar
         };
         rows.iter().filter_map(of).collect()
     };
-    let parts = [Part::InStates(Table::TaskState, vec![1, 3, 7]), Part::Whole(Table::Site), Part::Whole(Table::Timer)];
+    let parts = [
+        RowSelection::InStates(Table::TaskState, vec![1, 3, 7]),
+        RowSelection::Whole(Table::Site),
+        RowSelection::Whole(Table::Timer),
+    ];
     let read = store.read(&parts, named).await.unwrap();
     let keys: Vec<(Table, &str)> = read.rows.iter().map(|row| (row.key.table, &*row.key.id)).collect();
     let task = |id| (Table::TaskState, id);
@@ -310,9 +314,9 @@ async fn a_reading_holds_rows_by_key_and_what_belongs_to_each_that_it_holds(stor
         let is_first = rows.iter().any(|row| &*row.key.id == "asked/r1");
         is_first.then(|| Key::new(Table::Rollout, "named")).into_iter().collect()
     };
-    let asked = Part::Rows(vec![Key::new(Table::Rollout, "asked"), Key::new(Table::Rollout, "nobody")]);
-    let of_parents = Part::OfParents { table: Table::RolloutRobot, parents: Table::Rollout };
-    let parts = [Part::InStates(Table::Rollout, vec![1]), of_parents, asked];
+    let asked = RowSelection::Rows(vec![Key::new(Table::Rollout, "asked"), Key::new(Table::Rollout, "nobody")]);
+    let of_parents = RowSelection::OfParents { table: Table::RolloutRobot, parents: Table::Rollout };
+    let parts = [RowSelection::InStates(Table::Rollout, vec![1]), of_parents, asked];
     let read = store.read(&parts, named).await.unwrap();
     let keys: Vec<&str> = read.rows.iter().map(|row| &*row.key.id).collect();
     assert_eq!(keys, ["asked", "named", "open", "asked/r1", "named/r1", "open/r1", "open/r2"]);

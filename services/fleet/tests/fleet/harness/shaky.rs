@@ -4,7 +4,7 @@
 use async_trait::async_trait;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Expect, Item, Key, Log, Naming, Part, Row, Seq, Table, Writer};
+use midshift_core::rows::{Expect, Item, Key, Log, Naming, Row, RowSelection, Seq, Table, Writer};
 use midshift_store::{Applied, CommitError, Error, FeedPage, Query, Retention, Snapshot, Store, StoreId};
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -230,7 +230,7 @@ impl Store for Shaky {
         self.count(rows.len());
         Ok(rows)
     }
-    async fn read(&self, parts: &[Part], named: Naming) -> Result<Snapshot, Error> {
+    async fn read(&self, parts: &[RowSelection], named: Naming) -> Result<Snapshot, Error> {
         self.thaws().await;
         takes(&self.reads_for).await;
         let snapshot = self.inner.read(parts, named).await?;
