@@ -14,7 +14,7 @@ use midshift_core::projection::{self, DecisionKey};
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Item, Key, Row, Seq, Table};
 use midshift_core::time::Now;
-use midshift_store::leadership::{self, Settled};
+use midshift_store::leadership::{self, GroupOutcome};
 use midshift_store::{Applied, CommitError, Error, GET_KEYS_MAX, Store};
 use std::collections::BTreeSet;
 
@@ -69,15 +69,15 @@ impl Loop {
     /// Answers a command of which these items were committed, or decides it anew.
     fn settle(&mut self, mut asked: Box<PendingCommand>, results: Option<&[Result<Applied, CommitError>]>) {
         asked.lost += 1;
-        let answer = match results.map(leadership::settled) {
-            Some(Settled::Done) => Ok(()),
-            Some(Settled::Moved) if asked.lost < limits::COMMAND_TRIES => {
+        let answer = match results.map(leadership::group_outcome) {
+            Some(GroupOutcome::Done) => Ok(()),
+            Some(GroupOutcome::Moved) if asked.lost < limits::COMMAND_TRIES => {
                 metrics::counter!("midshift_fleet_commands_again_total").increment(1);
                 self.again.push(Request::Do(asked));
                 return;
             }
-            Some(Settled::Moved) => Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile)),
-            Some(Settled::Unknown) | None => Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)),
+            Some(GroupOutcome::Moved) => Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile)),
+            Some(GroupOutcome::Unknown) | None => Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)),
         };
         drop(asked.reply.send(answer));
     }

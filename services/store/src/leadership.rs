@@ -82,9 +82,9 @@ pub async fn release_lease<R: LeaderRow>(lease: &mut LeaderLease<R>, store: &dyn
     Some(left.is_ok_and(|results| results.iter().all(Result::is_ok)))
 }
 
-/// What became of items that were committed together.
+/// The outcome of items that were committed together.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Settled {
+pub enum GroupOutcome {
     /// All of them are in the store.
     Done,
     /// Others changed rows that they are about, so that some are not in the store: decide anew.
@@ -93,12 +93,12 @@ pub enum Settled {
     Unknown,
 }
 
-/// What became of items with these results.
-pub fn settled(results: &[Result<Applied, CommitError>]) -> Settled {
+/// Judges the results of items that were committed together.
+pub fn group_outcome(results: &[Result<Applied, CommitError>]) -> GroupOutcome {
     let is_conflict = |error: &CommitError| matches!(error, CommitError::Conflict { .. });
     match results.iter().filter_map(|result| result.as_ref().err()).map(is_conflict).min() {
-        None => Settled::Done,
-        Some(true) => Settled::Moved,
-        Some(false) => Settled::Unknown,
+        None => GroupOutcome::Done,
+        Some(true) => GroupOutcome::Moved,
+        Some(false) => GroupOutcome::Unknown,
     }
 }

@@ -25,7 +25,7 @@ use midshift_core::rows::{Entry, Item, Log, Seq, Table};
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, Now};
 use midshift_core::work::Live;
-use midshift_store::leadership::{self, Settled};
+use midshift_store::leadership::{self, GroupOutcome};
 use midshift_store::{Applied, CommitError, Dirty, Error, LiveBoard, Store, follow};
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -420,14 +420,14 @@ impl Loop {
         results: Option<&[Result<Applied, CommitError>]>,
     ) {
         asked.lost += 1;
-        let answer = match results.map(leadership::settled) {
-            Some(Settled::Done) => Ok(taken),
-            Some(Settled::Moved) if asked.lost < limits::COMMAND_TRIES => {
+        let answer = match results.map(leadership::group_outcome) {
+            Some(GroupOutcome::Done) => Ok(taken),
+            Some(GroupOutcome::Moved) if asked.lost < limits::COMMAND_TRIES => {
                 self.again.push(Request::Do(asked));
                 return;
             }
-            Some(Settled::Moved) => Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile)),
-            Some(Settled::Unknown) | None => Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)),
+            Some(GroupOutcome::Moved) => Err(Refusal::new(Kind::Unavailable, Code::MovedMeanwhile)),
+            Some(GroupOutcome::Unknown) | None => Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)),
         };
         drop(asked.reply.send(answer));
     }
