@@ -45,9 +45,9 @@ pub struct Access {
     pub identity: Option<Identity>,
 }
 
-/// What came of it.
+/// Who is let in no more after a restore, and the new token if one was asked for.
 #[derive(Clone, Default, PartialEq, Eq)]
-pub struct Settled {
+pub struct AccessOutcome {
     /// Tokens that ended.
     pub tokens: usize,
     /// Keys of robots that were taken out.
@@ -58,7 +58,7 @@ pub struct Settled {
     pub is_orphaned: bool,
 }
 
-impl fmt::Debug for Settled {
+impl fmt::Debug for AccessOutcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         // The secret is for whoever asked, and for no log.
         f.debug_struct("Settled").field("tokens", &self.tokens).field("keys", &self.keys).finish_non_exhaustive()
@@ -88,7 +88,12 @@ impl Access {
     ///
     /// # Errors
     /// A person must say something first; or rows cannot be read or written.
-    pub async fn put_right(&self, list: &[Revocation], site_id: &str, making: &mut Making) -> anyhow::Result<Settled> {
+    pub async fn put_right(
+        &self,
+        list: &[Revocation],
+        site_id: &str,
+        making: &mut Making,
+    ) -> anyhow::Result<AccessOutcome> {
         let site_id = SiteId::parse(site_id).context("reading whose the backup is")?;
         let data = making.places.data.clone();
         let settled = match &mut making.rows {
@@ -113,7 +118,7 @@ impl Access {
     }
 
     /// What is to be written; none: nobody is let in, so that there is nothing to ask.
-    fn decide(&self, rows: &[Row], list: &[Revocation], now: Utc) -> anyhow::Result<Option<(Item, Settled)>> {
+    fn decide(&self, rows: &[Row], list: &[Revocation], now: Utc) -> anyhow::Result<Option<(Item, AccessOutcome)>> {
         if self.revocations.is_none() && self.identity.is_none() {
             if restored::lets_somebody_in(rows, now)? {
                 bail!(ASKED);
@@ -125,7 +130,7 @@ impl Access {
         }
         let tokens = if self.identity == Some(Identity::ReIssue) { Tokens::Reissue } else { Tokens::Stay };
         let restored = restored::put_right(rows, list, tokens, now)?;
-        let settled = Settled {
+        let settled = AccessOutcome {
             tokens: restored.tokens,
             keys: restored.keys,
             secret: restored.secret,
@@ -135,8 +140,8 @@ impl Access {
     }
 }
 
-fn nothing() -> (Item, Settled) {
-    (Item::new(Writer::Identity, "midshift"), Settled::default())
+fn nothing() -> (Item, AccessOutcome) {
+    (Item::new(Writer::Identity, "midshift"), AccessOutcome::default())
 }
 
 /// The list goes on in the restored server: what it names, and these rows do not know, may be in a later backup.

@@ -5,7 +5,7 @@
 //! Of several processes that share the directory one at a time does that.
 //! The name of whoever made the backup is the one of the operating system: nobody signed in for it.
 
-use super::{Access, Settled, Summary};
+use super::{Access, AccessOutcome, Summary};
 use anyhow::Context;
 use midshift_core::audit::Note;
 use midshift_core::rows::{Item, Writer};
@@ -31,9 +31,9 @@ const LOOK_EVERY: Duration = Duration::from_secs(2);
 /// Bytes of such a file at most.
 const BYTES_MAX: u64 = 16 * 1024;
 
-/// A backup that was made.
+/// The notice of a backup that was made.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-struct Made {
+struct BackupNotice {
     /// Who, as the operating system knows it: `os:UID`.
     by: String,
     /// Where to, as it was asked for.
@@ -44,9 +44,9 @@ struct Made {
     parts: Vec<String>,
 }
 
-/// A restore that was made.
+/// The notice of a restore that was made.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-struct Restored {
+struct RestoreNotice {
     /// Who, as the operating system knows it: `os:UID`.
     by: String,
     /// Of which folder.
@@ -63,8 +63,8 @@ struct Restored {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 enum Word {
-    Made(Made),
-    Restored(Restored),
+    Made(BackupNotice),
+    Restored(RestoreNotice),
 }
 
 fn whoever_asks() -> String {
@@ -78,7 +78,7 @@ fn whoever_asks() -> String {
 pub fn leave_note(data: &Path, summary: &Summary, to: &Path) -> anyhow::Result<()> {
     let Utc(begun_unix_ms) = summary.begun;
     let parts = summary.parts.iter().map(|(name, ..)| name.clone()).collect();
-    let made = Made { by: whoever_asks(), to: to.display().to_string(), begun_unix_ms, parts };
+    let made = BackupNotice { by: whoever_asks(), to: to.display().to_string(), begun_unix_ms, parts };
     leave(data, &begun_unix_ms.to_string(), &Word::Made(made))
 }
 
@@ -86,10 +86,10 @@ pub fn leave_note(data: &Path, summary: &Summary, to: &Path) -> anyhow::Result<(
 ///
 /// # Errors
 /// The disk.
-pub fn leave_restored(data: &Path, from: &Path, access: &Access, settled: &Settled) -> anyhow::Result<()> {
+pub fn leave_restored(data: &Path, from: &Path, access: &Access, settled: &AccessOutcome) -> anyhow::Result<()> {
     let list = access.revocations.iter().map(|_| "revocations");
     let identity: Vec<&str> = list.chain(access.identity.map(super::Identity::as_str)).collect();
-    let restored = Restored {
+    let restored = RestoreNotice {
         by: whoever_asks(),
         from: from.display().to_string(),
         identity: identity.join(" "),
@@ -171,11 +171,11 @@ async fn take_all(data: &Path, store: &dyn Store, written: &mut BTreeSet<PathBuf
 /// The row for a file.
 fn row(path: &Path) -> Item {
     let (by, note) = match word(path) {
-        Ok(Word::Made(Made { by, to, begun_unix_ms, parts })) => {
+        Ok(Word::Made(BackupNotice { by, to, begun_unix_ms, parts })) => {
             let note = Note::new(MADE).with("to", to).with("parts", parts.join(" "));
             (by, note.with("begun_unix_ms", begun_unix_ms))
         }
-        Ok(Word::Restored(Restored { by, from, identity, tokens, keys })) => {
+        Ok(Word::Restored(RestoreNotice { by, from, identity, tokens, keys })) => {
             let note = Note::new(RESTORED).with("from", from).with("identity", identity);
             (by, note.with("tokens", tokens).with("keys", keys))
         }
@@ -231,7 +231,7 @@ mod tests {
         let left = super::super::files::entries(&dir.path().join(FOLDER)).expect("a folder");
         assert_eq!(left, [dir.path().join(FOLDER).join(TURN)]);
         let access = Access { identity: Some(super::super::Identity::ReIssue), ..Access::default() };
-        let settled = Settled { tokens: 3, keys: 0, secret: Some("mst.hush".to_owned()), is_orphaned: false };
+        let settled = AccessOutcome { tokens: 3, keys: 0, secret: Some("mst.hush".to_owned()), is_orphaned: false };
         leave_restored(dir.path(), Path::new("/mnt/backup"), &access, &settled).expect("told");
         take_all(dir.path(), &store, &mut written).await.expect("written");
         let newest = store.list(Query::all(Table::IdentityAudit)).await.expect("rows").pop().expect("a row");

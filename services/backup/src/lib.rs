@@ -17,7 +17,7 @@ mod rows;
 mod staging;
 mod stops;
 
-pub use access::{Access, Identity, Settled};
+pub use access::{Access, AccessOutcome, Identity};
 use anyhow::{Context, bail, ensure};
 use files::{blocking, write};
 use midshift_bundle::digest::Digest;
@@ -146,7 +146,7 @@ pub fn restore<'a>(
     to: &'a Places,
     access: &'a Access,
     now: Utc,
-) -> Boxed<'a, anyhow::Result<(Summary, Settled)>> {
+) -> Boxed<'a, anyhow::Result<(Summary, AccessOutcome)>> {
     Box::pin(async move {
         let revocations = access.list()?;
         let summary = verify(backup).await?;

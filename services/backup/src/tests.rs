@@ -2,7 +2,7 @@
 
 mod postgres;
 
-use super::{Access, Identity, Places, Settled, back_up, restore, verify};
+use super::{Access, AccessOutcome, Identity, Places, back_up, restore, verify};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::folder::Folder;
 use midshift_bundle::keys::SecretKey;
@@ -348,7 +348,7 @@ async fn whoever_was_revoked_since_the_backup_is_let_in_again_by_nothing_but_a_p
 
     let list = list_of_both(used.dir.path());
     let (_, settled) = restore(&backup, &to("merged"), &list, NOW).await.expect("restored");
-    assert_eq!(settled, Settled { tokens: 1, keys: 1, secret: None, is_orphaned: true });
+    assert_eq!(settled, AccessOutcome { tokens: 1, keys: 1, secret: None, is_orphaned: true });
     assert_eq!(let_in(&open(&to("merged").data).await.0).await, (false, false));
     let goes_on = RevocationList::read(&to("merged").data.join("identity").join(RevocationList::FILE)).expect("a list");
     assert_eq!(goes_on.len(), 2, "for a later restore");
@@ -358,7 +358,7 @@ async fn whoever_was_revoked_since_the_backup_is_let_in_again_by_nothing_but_a_p
     assert!(error.contains("takes nothing back"), "{error}");
     let said = |identity| Access { revocations: None, identity: Some(identity) };
     let (_, settled) = restore(&backup, &to("same"), &said(Identity::AsBackedUp), NOW).await.expect("restored");
-    assert_eq!((settled, let_in(&open(&to("same").data).await.0).await), (Settled::default(), (true, true)));
+    assert_eq!((settled, let_in(&open(&to("same").data).await.0).await), (AccessOutcome::default(), (true, true)));
     let (_, settled) = restore(&backup, &to("issued"), &said(Identity::ReIssue), NOW).await.expect("restored");
     assert_eq!((settled.tokens, settled.keys, settled.is_orphaned), (1, 0, false));
     assert_eq!(let_in(&open(&to("issued").data).await.0).await, (false, true));

@@ -1,6 +1,6 @@
 //! `midshift backup` and `midshift restore`.
 
-use midshift_backup::{Access, Identity, KEYS, Places, Settled, Summary};
+use midshift_backup::{Access, AccessOutcome, Identity, KEYS, Places, Summary};
 use midshift_cli::client::Exit;
 use midshift_cli::out::{Format, Out, columns};
 use midshift_process::clock;
@@ -89,7 +89,7 @@ pub async fn restore(args: &Restore, out: &Out) -> Result<(), Exit> {
 }
 
 /// What a person is told of tokens and robots.
-fn who_is_let_in(access: &Access, settled: &Settled) -> Vec<String> {
+fn who_is_let_in(access: &Access, settled: &AccessOutcome) -> Vec<String> {
     let mut lines = Vec::new();
     match (&access.revocations, access.identity) {
         (None, None) => {}
@@ -159,7 +159,7 @@ fn word(text: &str) -> String {
 }
 
 /// What is in a backup; of one that was restored, what became of tokens and robots too.
-fn show(summary: &Summary, settled: Option<&Settled>, out: &Out) -> Result<(), Exit> {
+fn show(summary: &Summary, settled: Option<&AccessOutcome>, out: &Out) -> Result<(), Exit> {
     let begun = timestamp(summary.begun).to_string();
     match out.format {
         Format::Table => {
@@ -226,17 +226,17 @@ mod tests {
 
     #[test]
     fn whoever_restores_is_told_who_is_let_in_and_what_is_left_to_do() {
-        let said = |revocations: Option<&str>, identity, settled: &Settled| {
+        let said = |revocations: Option<&str>, identity, settled: &AccessOutcome| {
             let access = Access { revocations: revocations.map(Into::into), identity };
             who_is_let_in(&access, settled).join("\n")
         };
-        let settled = Settled { tokens: 2, keys: 1, ..Settled::default() };
+        let settled = AccessOutcome { tokens: 2, keys: 1, ..AccessOutcome::default() };
         assert_eq!(said(None, None, &settled), "", "there is nobody");
         assert!(said(None, Some(Identity::AsBackedUp), &settled).contains("revoke again what was revoked since"));
         assert_eq!(said(Some("list"), None, &settled), "taken back: 2 tokens, 1 keys of robots");
-        let orphaned = Settled { is_orphaned: true, ..settled.clone() };
+        let orphaned = AccessOutcome { is_orphaned: true, ..settled.clone() };
         assert!(said(Some("list"), None, &orphaned).contains("--spare-token"));
-        let issued = Settled { secret: Some("mst.x".to_owned()), ..settled };
+        let issued = AccessOutcome { secret: Some("mst.x".to_owned()), ..settled };
         let told = said(None, Some(Identity::ReIssue), &issued);
         assert!(!told.contains("mst.x") && told.contains("robots are let in as they were"), "{told}");
         assert!(!format!("{issued:?}").contains("mst.x"), "no log has it");
