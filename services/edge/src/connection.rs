@@ -7,7 +7,7 @@
 use crate::activity::{Activity, Unused};
 use crate::config::{Config, std};
 use crate::denials::Denials;
-use crate::frame_heads::{Counted, Flooded};
+use crate::frame_heads::{CountedConnection, FloodFlag};
 use crate::listen::Io;
 use crate::peer::{ConnectionId, Denied, Peer, Principals};
 use crate::quota::network;
@@ -177,8 +177,8 @@ impl Port {
         if peer.certificate.is_some() {
             unauthenticated.set_authenticated();
         }
-        let flooded = Flooded::default();
-        let io = TokioIo::new(Counted::new(io, flooded.clone()));
+        let flooded = FloodFlag::default();
+        let io = TokioIo::new(CountedConnection::new(io, flooded.clone()));
         let mut served = pin!(self.http.serve_connection(io, door));
         let reason = tokio::select! {
             // First, so that no request is taken before its time is counted.
@@ -231,7 +231,7 @@ impl Port {
         if door.peer.certificate.is_some() {
             // That a connection was denied is told already.
             door.denials = None;
-            let io = TokioIo::new(Counted::new(io, Flooded::default()));
+            let io = TokioIo::new(CountedConnection::new(io, FloodFlag::default()));
             let served = self.http.serve_connection(io, door);
             let _ = timeout(std(limits::DENIED_LAST), served).await;
         }
@@ -270,7 +270,12 @@ impl Port {
         End::Denied
     }
 
-    fn ended(&self, peer: &Peer, done: Result<(), Box<dyn std::error::Error + Send + Sync>>, flooded: &Flooded) -> End {
+    fn ended(
+        &self,
+        peer: &Peer,
+        done: Result<(), Box<dyn std::error::Error + Send + Sync>>,
+        flooded: &FloodFlag,
+    ) -> End {
         let (port, from) = (self.config.port, network(peer.address.ip()));
         if flooded.is_set() {
             let (connection, address) = (peer.connection.0, peer.address);

@@ -143,26 +143,26 @@ impl Budget {
 
 /// Whether a connection was ended for its frames. Clones are the same.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Flooded(Arc<AtomicBool>);
+pub(crate) struct FloodFlag(Arc<AtomicBool>);
 
-impl Flooded {
+impl FloodFlag {
     pub fn is_set(&self) -> bool {
         self.0.load(Relaxed)
     }
 }
 
 /// A connection whose frames are counted.
-pub(crate) struct Counted<Io> {
+pub(crate) struct CountedConnection<Io> {
     io: Io,
     up: Place,
     down: Place,
     budget: Budget,
-    flooded: Flooded,
+    flooded: FloodFlag,
 }
 
-impl<Io> Counted<Io> {
+impl<Io> CountedConnection<Io> {
     /// From its first byte on; `flooded` says later whether it was ended for them.
-    pub fn new(io: Io, flooded: Flooded) -> Self {
+    pub fn new(io: Io, flooded: FloodFlag) -> Self {
         let down = Place::Head([0; HEAD_BYTES], 0);
         Self { io, up: Place::Preface(0), down, budget: Budget::new(Instant::now()), flooded }
     }
@@ -195,7 +195,7 @@ impl<Io> Counted<Io> {
     }
 }
 
-impl<Io: AsyncRead + Unpin> AsyncRead for Counted<Io> {
+impl<Io: AsyncRead + Unpin> AsyncRead for CountedConnection<Io> {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         let before = buffer.filled().len();
         match Pin::new(&mut self.io).poll_read(cx, buffer) {
@@ -205,7 +205,7 @@ impl<Io: AsyncRead + Unpin> AsyncRead for Counted<Io> {
     }
 }
 
-impl<Io: AsyncWrite + Unpin> AsyncWrite for Counted<Io> {
+impl<Io: AsyncWrite + Unpin> AsyncWrite for CountedConnection<Io> {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         let written = Pin::new(&mut self.io).poll_write(cx, bytes);
         if let Poll::Ready(Ok(n)) = written {
@@ -290,7 +290,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn a_burst_passes_and_then_what_time_gives_and_what_is_earned() {
-        let mut counted = Counted::new((), Flooded::default());
+        let mut counted = CountedConnection::new((), FloodFlag::default());
         counted.came(PREFACE).expect("the preface");
         let settings = frame(SETTINGS, 0, 0);
         for _ in 0..BURST {
@@ -350,7 +350,7 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn clients_that_see_each_10_s_that_the_line_stands_are_cut_neither_in_an_idle_watch_nor_in_a_fast_one() {
         for Client { name, begin, message, alive } in clients() {
-            let mut counted = Counted::new((), Flooded::default());
+            let mut counted = CountedConnection::new((), FloodFlag::default());
             counted.came(&[PREFACE, &begin.concat()].concat()).expect(name);
             counted.went(&[frame(SETTINGS, 0, 12), frame(HEADERS, 4, 20), frame(DATA, 0, 50)].concat());
             let (answers_to_us, our_answer) = (frame(6, 1, 8), frame(6, 1, 8));

@@ -28,7 +28,7 @@ enum Each {
 }
 
 #[derive(Debug)]
-struct Taken<K> {
+struct SlotsTaken<K> {
     total: usize,
     kinds: HashMap<K, usize>,
 }
@@ -37,7 +37,7 @@ struct Taken<K> {
 pub(crate) struct Quota<K> {
     total_max: usize,
     each: Each,
-    taken: Mutex<Taken<K>>,
+    taken: Mutex<SlotsTaken<K>>,
 }
 
 /// One who is inside.
@@ -58,7 +58,7 @@ impl<K: Eq + Hash + Clone> Quota<K> {
     }
 
     fn with(total_max: usize, each: Each) -> Arc<Self> {
-        let taken = Mutex::new(Taken { total: 0, kinds: HashMap::new() });
+        let taken = Mutex::new(SlotsTaken { total: 0, kinds: HashMap::new() });
         Arc::new(Self { total_max, each, taken })
     }
 
@@ -84,7 +84,7 @@ impl<K: Eq + Hash + Clone> Quota<K> {
 }
 
 impl<K> Quota<K> {
-    fn taken(&self) -> MutexGuard<'_, Taken<K>> {
+    fn taken(&self) -> MutexGuard<'_, SlotsTaken<K>> {
         self.taken.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -63,7 +63,13 @@ impl Rules {
     }
 
     /// Its slot and its caller's own deadline, or why it goes no further.
-    fn admit(&self, key: &QuotaKey, path: &str, headers: &HeaderMap, speech: &Speech) -> Result<Admitted, Refusal> {
+    fn admit(
+        &self,
+        key: &QuotaKey,
+        path: &str,
+        headers: &HeaderMap,
+        speech: &Speech,
+    ) -> Result<AdmittedRequest, Refusal> {
         let (class, now) = (access::class(path).with(self.bugs), Instant::now());
         if !self.rates.admit(key, now, class) {
             return Err(Refusal::new(Kind::Exhausted, Code::TooManyRequests));
@@ -84,7 +90,7 @@ impl Rules {
         let slot = Inside::new(&self.gauge, slots, watch);
         let given = if *speech == Speech::Http { None } else { deadline::given(headers)? };
         // A time that no clock reaches is none.
-        Ok(Admitted { slot, deadline: given.and_then(|given| now.checked_add(given)) })
+        Ok(AdmittedRequest { slot, deadline: given.and_then(|given| now.checked_add(given)) })
     }
 }
 
@@ -97,13 +103,14 @@ fn refused(full: Full, what: &str) -> Refusal {
     Refusal::new(Kind::Exhausted, reason)
 }
 
-struct Admitted {
+/// A request that may go on to its service, with its slot and its deadline.
+struct AdmittedRequest {
     slot: Inside,
     deadline: Option<Instant>,
 }
 
-/// What an answer keeps until its body is gone. Fields are never read.
-type Held = (OpenStream, Option<Inside>);
+/// Guards that an answer holds until its body is gone. They are never read.
+type AnswerGuards = (OpenStream, Option<Inside>);
 
 /// One request under way, with its slot among all, and among those of unauthenticated callers.
 pub(crate) struct Inside {
@@ -162,7 +169,7 @@ impl Door {
     }
 
     /// Who asks, and what it holds for that; or why it goes no further.
-    fn admit(&self, request: &Request<Incoming>, speech: &Speech) -> Result<(Caller, Admitted), Refusal> {
+    fn admit(&self, request: &Request<Incoming>, speech: &Speech) -> Result<(Caller, AdmittedRequest), Refusal> {
         let (path, headers) = (request.uri().path(), request.headers());
         let caller = self.principals.caller(&self.peer, headers);
         let key = QuotaKey::from_caller(caller.as_ref(), self.peer.address.ip());
@@ -243,7 +250,7 @@ impl DenialSink for PortDenials {
 }
 
 impl HyperService<Request<Incoming>> for Door {
-    type Response = Response<Bounded<Held>>;
+    type Response = Response<Bounded<AnswerGuards>>;
     type Error = Infallible;
     type Future = Boxed<'static, Result<Self::Response, Infallible>>;
 
@@ -251,7 +258,7 @@ impl HyperService<Request<Incoming>> for Door {
         let (stream, now) = (self.activity.begin(), Instant::now());
         let over = Over::new(&self.peer);
         let speech = Speech::from_headers(request.headers());
-        let (caller, Admitted { slot, deadline }) = match self.admit(&request, &speech) {
+        let (caller, AdmittedRequest { slot, deadline }) = match self.admit(&request, &speech) {
             Ok(admitted) => admitted,
             Err(refusal) => {
                 let (port, reason) = (self.rules.port, refusal.reason.code.as_str());
