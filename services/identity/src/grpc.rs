@@ -3,7 +3,7 @@
 use crate::authority::{Authority, SignedCertificate, read_signing_request};
 use crate::register::decided;
 use crate::tokens::rotate::{self, Turn};
-use crate::tokens::{self, Wanted};
+use crate::tokens::{self, NewToken};
 use crate::{Error, IdentityService, encode};
 use midshift_core::audit::Note;
 use midshift_core::identity::{Caller, Principal, Replace, RobotIdentity, Secret, TokenId};
@@ -67,7 +67,7 @@ impl IdentityService {
     }
 
     async fn make_token(&self, r: v1::CreateTokenRequest, actor: &Caller) -> Result<v1::CreateTokenResponse, Refusal> {
-        let wanted = Wanted::check(&r)?;
+        let wanted = NewToken::check(&r)?;
         let (record, secret) = tokens::create(&self.0.register, &wanted, &actor.into(), self.now()).await?;
         Ok(v1::CreateTokenResponse { token: Some(encode::token(&record)), secret: secret.reveal(Secret::TOKEN) })
     }

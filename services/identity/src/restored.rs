@@ -23,8 +23,8 @@ pub enum Tokens {
     Reissue,
 }
 
-/// What is to be written, and what it comes to.
-pub struct Restored {
+/// The rows that take access back after a restore, and how many tokens and keys end by them.
+pub struct RestoredAccess {
     /// The rows.
     pub item: Item,
     /// Tokens that end.
@@ -74,7 +74,7 @@ pub fn lets_somebody_in(rows: &[Row], now: Utc) -> Result<bool, BadRow> {
 ///
 /// # Errors
 /// A row that cannot be read.
-pub fn put_right(rows: &[Row], list: &[Revocation], ending: Tokens, now: Utc) -> Result<Restored, BadRow> {
+pub fn put_right(rows: &[Row], list: &[Revocation], ending: Tokens, now: Utc) -> Result<RestoredAccess, BadRow> {
     let mut view = View::read(rows)?;
     let before = (view.tokens.clone(), view.robots.clone());
     let (mut tokens, mut keys) = (0, 0);
@@ -117,7 +117,7 @@ pub fn put_right(rows: &[Row], list: &[Revocation], ending: Tokens, now: Utc) ->
     }
     put_names_right(&view, now, &mut item);
     let is_administered = view.tokens.values().any(|(token, _)| tokens::administers(token, now));
-    Ok(Restored { item, tokens, keys, secret, is_administered })
+    Ok(RestoredAccess { item, tokens, keys, secret, is_administered })
 }
 
 /// A name goes with its token, and the new token takes its own.

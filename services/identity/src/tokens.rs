@@ -41,9 +41,9 @@ pub fn digest(secret: &Secret) -> Digest {
     Digest(sha2::Sha256::digest(secret.bytes()).into())
 }
 
-/// What a token is to be.
+/// A token that is to be made.
 #[derive(Clone, Debug)]
-pub struct Wanted {
+pub struct NewToken {
     /// Who it stands for.
     pub name: String,
     /// The person who has it; none: the name stands for itself.
@@ -74,7 +74,7 @@ fn check_valid(valid_seconds: u64, bad: &mut Violations) -> LinkDuration {
     DAY
 }
 
-impl Wanted {
+impl NewToken {
     /// Checks what was asked for.
     ///
     /// # Errors
@@ -132,7 +132,7 @@ pub fn spare_name(is_taken: impl Fn(&str) -> bool) -> String {
     names.find(|name| !is_taken(name)).unwrap_or_else(|| FIRST.to_owned())
 }
 
-fn everything() -> Wanted {
+fn everything() -> NewToken {
     let site = |role| Grant { role, scope: Scope::Site };
     let roles = [
         Role::Admin,
@@ -143,7 +143,7 @@ fn everything() -> Wanted {
         Role::StopResetter,
         Role::Auditor,
     ];
-    Wanted { name: FIRST.to_owned(), person: None, grants: roles.map(site).into(), valid: limits::TOKEN_VALID_MAX }
+    NewToken { name: FIRST.to_owned(), person: None, grants: roles.map(site).into(), valid: limits::TOKEN_VALID_MAX }
 }
 
 fn note(action: &'static str, token: &TokenRecord) -> Note {
@@ -204,7 +204,7 @@ pub async fn spare(register: &Register, now: Utc) -> Result<Secret, Refusal> {
 /// A token of its name stands, or there are too many; the store.
 pub async fn create(
     register: &Register,
-    wanted: &Wanted,
+    wanted: &NewToken,
     by: &Actor,
     now: Utc,
 ) -> Result<(TokenRecord, Secret), Refusal> {

@@ -22,9 +22,9 @@ const PAGE_BYTES: usize = 1 << 20;
 /// A wall clock that was set back shows rows of a chain in another order of time than of number, by less than this.
 const CLOCK_SLACK_MS: i64 = 24 * 3_600_000;
 
-/// What is looked for.
+/// Filters rows of the audit.
 #[derive(Debug, Default)]
-struct Wanted {
+struct AuditFilter {
     actor: String,
     robot: Option<String>,
     subject: String,
@@ -33,7 +33,7 @@ struct Wanted {
     until_unix_ms: Option<i64>,
 }
 
-impl Wanted {
+impl AuditFilter {
     fn fits(&self, row: &AuditRow) -> bool {
         (self.actor.is_empty() || row.actor == self.actor)
             && self.robot.as_ref().is_none_or(|robot| row.about.contains(robot))
@@ -120,7 +120,7 @@ impl AuditService {
         let since = parse_time(r.since.as_ref(), At::top("since"), &mut bad);
         let until = parse_time(r.until.as_ref(), At::top("until"), &mut bad);
         bad.finish()?;
-        let wanted = Wanted {
+        let wanted = AuditFilter {
             actor: r.actor,
             robot: robot.map(|id| format!("robot:{id}")),
             subject: r.subject,
