@@ -21,9 +21,9 @@ use crate::rollout::decision::plan::{Plan, Tx};
 use crate::rollout::judgement::{effort, refusals, verdict};
 use crate::rollout::members::assign;
 use crate::rollout::phases::{advance, pauses};
-use crate::rollout::projection::requests::{Ask, CheckOnly, Command, Taken, Verb};
+use crate::rollout::projection::requests::{Ask, CheckOnly, Command, CommandOutcome, Verb};
 use crate::rollout::projection::rows::{
-    Act, Bundle, Counted, Outcome, Pause, Phase, Quarantine, RobotSoftware, Rollout, RolloutRobot, Verdict,
+    Act, Bundle, Outcome, Pause, Phase, Quarantine, RobotSoftware, Rollout, RolloutRobot, TaskBaseline, Verdict,
 };
 use crate::rollout::projection::spec::{RolloutSpec, Wave};
 use crate::rollout::projection::state::RolloutProjection;
@@ -45,7 +45,7 @@ pub fn decide_request(
     now: Now,
     ask: &Ask,
     plan: &mut Plan,
-) -> Result<Taken, Refusal> {
+) -> Result<CommandOutcome, Refusal> {
     let Ask { command, seen, check_only, request_id, by } = ask;
     let actor = &Actor::from(by);
     // For the audit, also if whoever asks may not. What it may not even see is about nothing that there is, and leaves
@@ -61,11 +61,11 @@ pub fn decide_request(
     if let Some(id) = request_id
         && let Some(at) = idempotency::done_before(&view.command_keys, id, command, *seen)?
     {
-        return Ok(Taken::Before(at));
+        return Ok(CommandOutcome::Before(at));
     }
     let is_done = check_command(view, board, command, *seen).map_err(refused)?;
     if *check_only == CheckOnly::Yes {
-        return Ok(Taken::Now);
+        return Ok(CommandOutcome::Now);
     }
     match request_id {
         None if is_done => {}
@@ -80,7 +80,7 @@ pub fn decide_request(
             plan.items.extend(tx.finish());
         }
     }
-    Ok(Taken::Now)
+    Ok(CommandOutcome::Now)
 }
 
 /// Carries out a command that passed its check: one item for most, many for a start.
@@ -261,7 +261,7 @@ fn start(
     let others = find_overlapping(view, &rollout, robots.iter().map(|(id, ..)| id));
     let control = verdict::tasks_of_controls(view, &rollout);
     let effort = effort::effort_of_controls(view, &rollout);
-    let counted = Arc::new(Counted { at_ms: view.served_ms(&now), control, effort, ..Counted::default() });
+    let counted = Arc::new(TaskBaseline { at_ms: view.served_ms(&now), control, effort, ..TaskBaseline::default() });
     if supersede {
         for other in &others {
             plan.decide(view, now, actor, |tx| {

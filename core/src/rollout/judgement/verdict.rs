@@ -14,7 +14,7 @@ use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, Presence};
 use crate::rollout::decision::plan::Tx;
-use crate::rollout::projection::rows::{Abort, Counted, Outcome, Rollout, RolloutRobot, Step, Verdict};
+use crate::rollout::projection::rows::{Abort, Outcome, Rollout, RolloutRobot, Step, TaskBaseline, Verdict};
 use crate::rollout::projection::spec::{SmallWave, SmallWaveFailure};
 use crate::rollout::projection::state::RolloutProjection;
 use crate::rollout::projection::timestamp::Stamp;
@@ -83,7 +83,7 @@ pub fn count_tasks(tx: &mut Tx, id: &RolloutId) {
     let news = trial.iter().map(|(id, tally)| (id.clone(), tasks_since(*tally, before(id)))).collect();
     let mut tasks = rollout.tasks.clone();
     tasks.observe(&news, tasks_since(control, rollout.counted.control));
-    let counted = Arc::new(Counted { at_ms, trial, control, effort: rollout.counted.effort });
+    let counted = Arc::new(TaskBaseline { at_ms, trial, control, effort: rollout.counted.effort });
     let efforts = effort::see_efforts(tx.view, rollout);
     let row = Rollout { tasks, counted, efforts, ..rollout.clone() };
     tx.put_row(row, "rollout.tasks_counted");

@@ -151,9 +151,9 @@ pub enum CheckOnly {
     No,
 }
 
-/// What became of a request that nothing is against.
+/// The outcome of a command that no rule refuses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Taken {
+pub enum CommandOutcome {
     /// It is carried out, or may be if it was only to be checked. It may be that it changes nothing.
     Now,
     /// It was carried out then under its request_id, UTC of the wall. Nothing is done now, nor would be.

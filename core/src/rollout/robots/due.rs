@@ -20,7 +20,7 @@ use crate::rollout::judgement::failures::is_hard;
 use crate::rollout::judgement::{infrastructure, jams, verdict};
 use crate::rollout::members::{area_bundles, matching};
 use crate::rollout::projection::queue::{is_directive_old, is_late, is_newcomer, is_on, is_retried, waits_out};
-use crate::rollout::projection::rows::{Given, Pause, Phase, Rollout, RolloutRobot, Step};
+use crate::rollout::projection::rows::{GivenPermission, Pause, Phase, Rollout, RolloutRobot, Step};
 use crate::rollout::projection::spec::AbortScope;
 use crate::rollout::projection::state::RolloutProjection;
 use crate::time::Now;
@@ -344,7 +344,7 @@ impl<'a> Situation<'a> {
 
     /// A permission that was seen unused: past its life a heartbeat of the current session says so, and nothing it said
     /// before is on its way.
-    fn unused(self, given: &Given) -> Option<Move> {
+    fn unused(self, given: &GivenPermission) -> Option<Move> {
         let Self { view, r, .. } = self;
         let life_ms = given.authority.life_ms();
         if view.bugs.time_releases_drain() {

@@ -24,7 +24,7 @@ use crate::rollout::members::matching::other_key;
 use crate::rollout::members::newcomers;
 use crate::rollout::projection::queue::{is_directive_old, is_retried};
 use crate::rollout::projection::rows::{
-    Act, Given, Lost, OtaClock, RobotSoftware, Rollout, RolloutRobot, Step, WayBack,
+    Act, GivenPermission, Lost, OtaClock, RobotSoftware, Rollout, RolloutRobot, Step, WayBack,
 };
 use crate::rollout::projection::state::RolloutProjection;
 use crate::rollout::projection::timestamp::Stamp;
@@ -462,7 +462,7 @@ fn give_grant(tx: &mut Tx, board: &Board, rollout: &Rollout, mut r: RolloutRobot
     let grant_id = next_number(tx, used);
     let given = ActivationGrant { grant_id, drain_id, authority };
     change_desired(tx, &r.robot_id, |d| d.grant = Some(given));
-    r.grant = Some(Given { grant_id, authority, generation: rollout.generation });
+    r.grant = Some(GivenPermission { grant_id, authority, generation: rollout.generation });
     r.moments.granted_link = Some(stamp_now(tx));
     r.attempted = true;
     tx.put_row(r, "robot.granted");

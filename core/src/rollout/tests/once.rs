@@ -3,7 +3,7 @@
 use super::*;
 use crate::idempotency::CommandKey;
 use crate::identity::Caller;
-use crate::rollout::requests::{Ask, CheckOnly, Taken};
+use crate::rollout::requests::{Ask, CheckOnly, CommandOutcome};
 
 fn pin(n: usize) -> Command {
     Command::Pin { robot_id: robot_id(n), reason: "trial".into() }
@@ -20,9 +20,9 @@ fn asked(command: &Command, check_only: CheckOnly, request_id: Option<&str>) -> 
 }
 
 impl Rig {
-    fn once(&mut self, command: &Command, request_id: &str) -> Result<Taken, Refusal> {
+    fn once(&mut self, command: &Command, request_id: &str) -> Result<CommandOutcome, Refusal> {
         self.ota_turn();
-        let mut taken = Ok(Taken::Now);
+        let mut taken = Ok(CommandOutcome::Now);
         let ask = asked(command, CheckOnly::No, Some(request_id));
         self.ota_plan(|rig, plan| taken = decide_request(&mut rig.ota, &rig.board, rig.now, &ask, plan));
         taken
@@ -78,7 +78,7 @@ fn what_is_only_checked_writes_nothing_and_finds_what_would_be_refused() {
         for id in [None, Some("a")] {
             let ask = asked(&command, CheckOnly::Yes, id);
             let taken = decide_request(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan);
-            assert_eq!(taken.expect("nothing is against it"), Taken::Now);
+            assert_eq!(taken.expect("nothing is against it"), CommandOutcome::Now);
         }
         assert_eq!(plan.items, Vec::<Item>::new(), "{command:?}");
     }
@@ -100,7 +100,7 @@ fn each_command_is_carried_out_once_for_its_request_id_and_another_one_is_refuse
         for check_only in [CheckOnly::No, CheckOnly::Yes] {
             let ask = asked(&command, check_only, Some(&id));
             let taken = decide_request(&mut rig.ota, &rig.board, rig.now, &ask, &mut plan).expect("it was done");
-            assert_eq!(taken, Taken::Before(Utc(key.at_unix_ms)), "{command:?} {check_only:?}");
+            assert_eq!(taken, CommandOutcome::Before(Utc(key.at_unix_ms)), "{command:?} {check_only:?}");
         }
         assert_eq!(plan.items, Vec::<Item>::new(), "{command:?}");
         assert_eq!(rig.once(&pin(7), &id).expect_err("it is taken").reason.code, Code::RequestIdReused);

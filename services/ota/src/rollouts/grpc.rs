@@ -11,7 +11,7 @@ use midshift_core::reason::{Code, Kind, Refusal, Violations};
 use midshift_core::rollout::dry_run::dry_run;
 use midshift_core::rollout::objects;
 use midshift_core::rollout::projection::RolloutProjection;
-use midshift_core::rollout::requests::{CheckOnly, Command, Taken, Verb};
+use midshift_core::rollout::requests::{CheckOnly, Command, CommandOutcome, Verb};
 use midshift_core::rollout::rows::{Quarantine, Rollout};
 use midshift_proto::access::caller;
 use midshift_proto::convert::task::revision_of;
@@ -60,10 +60,10 @@ fn check_only(validate_only: bool) -> CheckOnly {
 }
 
 /// When a call with the same request_id did it, for an answer; none: no such call.
-fn done_before(taken: Taken) -> Option<prost_types::Timestamp> {
+fn done_before(taken: CommandOutcome) -> Option<prost_types::Timestamp> {
     match taken {
-        Taken::Now => None,
-        Taken::Before(at) => Some(timestamp(at)),
+        CommandOutcome::Now => None,
+        CommandOutcome::Before(at) => Some(timestamp(at)),
     }
 }
 
@@ -112,7 +112,7 @@ impl RolloutService {
         needs_etag: bool,
         check_only: CheckOnly,
         request_id: Option<String>,
-    ) -> Result<(v1::Rollout, Taken), Refusal> {
+    ) -> Result<(v1::Rollout, CommandOutcome), Refusal> {
         let mut bad = Violations::default();
         let rollout_id = bad.accept("rollout_id", RolloutId::parse(about.rollout_id));
         if about.reason.len() > limits::REASON_BYTES_MAX {

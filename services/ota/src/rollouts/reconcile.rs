@@ -18,7 +18,7 @@ use midshift_core::projection;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::bugs::Bugs;
 use midshift_core::rollout::projection::RolloutProjection;
-use midshift_core::rollout::requests::{CheckOnly, Taken};
+use midshift_core::rollout::requests::{CheckOnly, CommandOutcome};
 use midshift_core::rollout::retention::needed_bundles;
 use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, cycle, decide_request, ended, obeyed, tell_damaged};
 use midshift_core::rows::{Entry, Item, Log, Seq, Table};
@@ -85,7 +85,7 @@ pub(super) struct Loop {
 }
 
 /// Commands, what is answered, and the items of a plan that must be committed before.
-type Replies = Vec<(Box<PendingCommand>, Taken, Range<usize>)>;
+type Replies = Vec<(Box<PendingCommand>, CommandOutcome, Range<usize>)>;
 
 impl Planner {
     /// Runs until `shutdown`. On a server without keys it only waits: nothing can be signed.
@@ -416,7 +416,7 @@ impl Loop {
     fn settle(
         &mut self,
         mut asked: Box<PendingCommand>,
-        taken: Taken,
+        taken: CommandOutcome,
         results: Option<&[Result<Applied, CommitError>]>,
     ) {
         asked.lost += 1;

@@ -4,7 +4,7 @@ use midshift_core::ids::RolloutId;
 use midshift_core::reason::Refusal;
 use midshift_core::rollout::Board;
 use midshift_core::rollout::projection::RolloutProjection;
-use midshift_core::rollout::requests::{Ask, Taken};
+use midshift_core::rollout::requests::{Ask, CommandOutcome};
 use midshift_core::time::Now;
 use tokio::sync::oneshot;
 
@@ -29,7 +29,7 @@ pub enum Request {
 /// A command, until it is answered.
 pub struct PendingCommand {
     pub ask: Ask,
-    pub reply: oneshot::Sender<Result<Taken, Refusal>>,
+    pub reply: oneshot::Sender<Result<CommandOutcome, Refusal>>,
     /// How often it was decided and lost, because what it is about had been changed meanwhile.
     pub lost: u32,
 }

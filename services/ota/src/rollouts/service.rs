@@ -9,7 +9,7 @@ use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rollout::Board;
 use midshift_core::rollout::projection::RolloutProjection;
-use midshift_core::rollout::requests::{Ask, CheckOnly, Command, Taken};
+use midshift_core::rollout::requests::{Ask, CheckOnly, Command, CommandOutcome};
 use midshift_core::rollout::spec::PROBATION_DEFAULT_MS;
 use midshift_core::rows::{Revision, Seq};
 use midshift_core::time::Now;
@@ -106,7 +106,7 @@ impl RolloutService {
         seen: Option<Revision>,
         check_only: CheckOnly,
         request_id: Option<String>,
-    ) -> Result<Taken, Refusal> {
+    ) -> Result<CommandOutcome, Refusal> {
         let (reply, answer) = oneshot::channel();
         let ask = Ask { command, seen, check_only, request_id, by: by.clone() };
         self.send(Request::Do(Box::new(PendingCommand { ask, reply, lost: 0 }))).await?;

@@ -9,7 +9,7 @@ use super::requests::Request;
 use midshift_core::limits;
 use midshift_core::projection;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rollout::requests::{Ask, Taken};
+use midshift_core::rollout::requests::{Ask, CommandOutcome};
 use midshift_core::rollout::{LOGS, Plan, decide_request, follow_rows, reread, tell_damaged};
 use midshift_core::rows::{Entry, Log, Table};
 use midshift_store::{CommitError, Error, follow};
@@ -91,7 +91,7 @@ impl Loop {
     }
 
     /// The answer to whoever asked. An error: what came of it may not be in the projection.
-    async fn carry_out(&mut self, ask: &Ask) -> Result<Result<Taken, Refusal>, Error> {
+    async fn carry_out(&mut self, ask: &Ask) -> Result<Result<CommandOutcome, Refusal>, Error> {
         for _ in 0..limits::COMMAND_TRIES {
             let mut plan = Plan::default();
             let taken = decide_request(&mut self.view, &self.board, self.parts.clock.now(), ask, &mut plan);

@@ -4,8 +4,8 @@
 mod robot;
 mod rollout;
 
-pub use robot::{Given, Lost, Moments, Quarantine, RobotSoftware, RolloutRobot, Step, WayBack};
-pub use rollout::{Abort, Act, Bundle, Countdown, Counted, Ending, Outcome, Pause, Phase, Rollout, Verdict};
+pub use robot::{GivenPermission, Lost, Moments, Quarantine, RobotSoftware, RolloutRobot, Step, WayBack};
+pub use rollout::{Abort, Act, Bundle, Countdown, Ending, Outcome, Pause, Phase, Rollout, TaskBaseline, Verdict};
 
 use crate::ids::{AreaId, RolloutId};
 use crate::rows::{Index, Record, Seq, Table, body_is_json};

@@ -71,9 +71,9 @@ impl Step {
     }
 }
 
-/// Permission that was given.
+/// The permission that a robot was given to change its software.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Given {
+pub struct GivenPermission {
     /// Its number.
     pub grant_id: u64,
     /// What it is anchored to.
@@ -164,7 +164,7 @@ pub struct RolloutRobot {
     /// The robot asked for permission in its drain.
     pub ready: bool,
     /// Newest permission that was not seen unused.
-    pub grant: Option<Given>,
+    pub grant: Option<GivenPermission>,
     /// The last permission of its drain was seen unused.
     #[serde(default)]
     pub not_used: bool,

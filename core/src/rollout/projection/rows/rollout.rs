@@ -281,9 +281,9 @@ pub struct Abort {
     pub actor: Option<String>,
 }
 
-/// Up to where tasks were counted.
+/// The tasks that were counted up to the last count, from which newer ones are counted.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Counted {
+pub struct TaskBaseline {
     /// Serving time of the last count, milliseconds of the site clock.
     pub at_ms: u64,
     /// All that had ended on trial by then, by robot.
@@ -340,7 +340,7 @@ pub struct Rollout {
     /// What tasks say of the bundle so far.
     pub tasks: FailureEvidence,
     /// Up to where tasks were counted for that.
-    pub counted: Arc<Counted>,
+    pub counted: Arc<TaskBaseline>,
     /// What work cost its robots and the others when tasks were counted last.
     #[serde(default)]
     pub efforts: Efforts,
