@@ -9,9 +9,9 @@ use crate::limits;
 use crate::time::LinkTime;
 use std::collections::BTreeMap;
 
-/// What became of one peer's events of one line.
+/// How many events of one peer and line were written and left out since the last count.
 #[derive(Clone, Copy, Debug)]
-struct Seen {
+struct LineCounts {
     /// When they are counted next.
     until: LinkTime,
     /// Written since the last count.
@@ -34,7 +34,7 @@ pub struct Count<L> {
 /// Events of all lines.
 #[derive(Debug)]
 pub struct Floods<L> {
-    seen: BTreeMap<(L, Option<String>), Seen>,
+    seen: BTreeMap<(L, Option<String>), LineCounts>,
 }
 
 impl<L> Default for Floods<L> {
@@ -50,7 +50,7 @@ impl<L: Ord + Clone> Floods<L> {
         if self.seen.len() >= limits::FLOOD_PEERS_MAX && !self.seen.contains_key(&key) {
             key.1 = None;
         }
-        let fresh = Seen { until: now + limits::FLOOD_COUNTED_EVERY, written: 0, left_out: 0 };
+        let fresh = LineCounts { until: now + limits::FLOOD_COUNTED_EVERY, written: 0, left_out: 0 };
         let seen = self.seen.entry(key).or_insert(fresh);
         let is_written = seen.written < limits::FLOOD_LINES;
         if is_written {

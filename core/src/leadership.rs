@@ -98,9 +98,9 @@ pub enum LeaderRole {
     StandsBy,
 }
 
-/// The row as a process has seen it.
+/// The lease row as a process has observed it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Seen {
+pub struct ObservedLease {
     /// Who holds it; empty: nobody, or there is no row.
     pub holder: String,
     /// Its number.
@@ -114,7 +114,13 @@ pub struct Seen {
 }
 
 /// Decides what the process `own_id` does about the lease at `now`.
-pub fn decide(own_id: &str, role: LeaderRole, seen: &Seen, contenders: Contenders, now: LinkTime) -> LeaseAction {
+pub fn decide(
+    own_id: &str,
+    role: LeaderRole,
+    seen: &ObservedLease,
+    contenders: Contenders,
+    now: LinkTime,
+) -> LeaseAction {
     let mine = seen.holder == own_id;
     match (role, contenders) {
         (_, Contenders::Ignored) => LeaseAction::Lead,
@@ -140,7 +146,7 @@ pub struct LeaderLease<R> {
     own_id: String,
     contenders: Contenders,
     role: LeaderRole,
-    seen: Option<Seen>,
+    seen: Option<ObservedLease>,
     row: PhantomData<R>,
 }
 
@@ -165,8 +171,13 @@ impl<R: LeaderRow> LeaderLease<R> {
         let Some(row) = row else {
             if self.seen.is_none() {
                 let nobody = String::new();
-                self.seen =
-                    Some(Seen { holder: nobody, beat: 0, revision: Revision(0), since: now, from_before: true });
+                self.seen = Some(ObservedLease {
+                    holder: nobody,
+                    beat: 0,
+                    revision: Revision(0),
+                    since: now,
+                    from_before: true,
+                });
             }
             return Ok(());
         };
@@ -176,7 +187,7 @@ impl<R: LeaderRow> LeaderLease<R> {
         }
         let (decoded, revision) = (row.decode::<R>()?, row.revision);
         let (holder, beat) = (decoded.holder().to_owned(), decoded.beat());
-        self.seen = Some(Seen { holder, beat, revision, since: now, from_before });
+        self.seen = Some(ObservedLease { holder, beat, revision, since: now, from_before });
         Ok(())
     }
     /// Takes what the feed says of the row.
@@ -206,7 +217,7 @@ impl<R: LeaderRow> LeaderLease<R> {
         let seen = self.seen.as_ref();
         let (revision, beat) = seen.map_or((Revision(0), 0), |s| (s.revision, s.beat));
         let (revision, beat) = (revision.next(), beat + 1);
-        self.seen = Some(Seen { holder: self.own_id.clone(), beat, revision, since: at, from_before: false });
+        self.seen = Some(ObservedLease { holder: self.own_id.clone(), beat, revision, since: at, from_before: false });
         self.role = LeaderRole::Leads(at);
     }
     /// The item that lets another one lead at once; none: this process does not lead, or there is no other.
@@ -260,14 +271,14 @@ mod tests {
     use super::*;
     use crate::time::LinkDuration;
 
-    fn seen(holder: &str, since: u64, from_before: bool) -> Seen {
-        Seen { holder: holder.to_owned(), beat: 7, revision: Revision(7), since: LinkTime(since), from_before }
+    fn seen(holder: &str, since: u64, from_before: bool) -> ObservedLease {
+        ObservedLease { holder: holder.to_owned(), beat: 7, revision: Revision(7), since: LinkTime(since), from_before }
     }
 
     #[test]
     fn the_table_of_the_lease() {
         use LeaseAction::{Lead, Renew, StandBy, StepDown, TakeOver};
-        let table: &[(&str, LeaderRole, Seen, Contenders, u64, LeaseAction)] = &[
+        let table: &[(&str, LeaderRole, ObservedLease, Contenders, u64, LeaseAction)] = &[
             ("no row", LeaderRole::StandsBy, seen("", 0, true), Contenders::Some, 0, TakeOver),
             ("an empty row", LeaderRole::StandsBy, seen("", 900, false), Contenders::Some, 900, TakeOver),
             ("somebody leads", LeaderRole::StandsBy, seen("b", 0, true), Contenders::Some, 3_999, StandBy),

@@ -112,12 +112,12 @@ impl Judge {
 struct Steps {
     /// Milliseconds, as one.
     off_ms: i64,
-    doubted: Option<Doubted>,
+    doubted: Option<DoubtedWall>,
 }
 
 /// A wall in doubt.
 #[derive(Clone, Copy, Debug)]
-struct Doubted {
+struct DoubtedWall {
     doubt: Doubt,
     /// It is over when the wall is no further off than this, milliseconds.
     most_ms: u64,
@@ -133,7 +133,7 @@ impl Steps {
         if self.off_ms.unsigned_abs() > most_ms {
             let doubt = Doubt { step_ms: self.off_ms, at };
             let synced = self.doubted.map_or_else(synced, |doubted| doubted.synced);
-            self.doubted = Some(Doubted { doubt, most_ms, synced });
+            self.doubted = Some(DoubtedWall { doubt, most_ms, synced });
         } else if self.doubted.is_some() {
             *self = Self::default();
         }

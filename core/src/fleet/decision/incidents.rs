@@ -3,7 +3,7 @@
 //! Invariant: there are at most [`limits::INCIDENTS_MAX`]; the oldest goes for a new one, a closed one before an open one.
 
 use super::plan::{Plan, Tx};
-use crate::fleet::projection::rows::{Closed, Incident};
+use crate::fleet::projection::rows::{Incident, IncidentClosure};
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{PlaceId, RobotId, TaskId};
 use crate::limits;
@@ -105,7 +105,7 @@ pub fn close_about(tx: &mut Tx, code: Code, robot_id: &RobotId, reason: &str) {
 /// A person has looked into it.
 pub fn close(tx: &mut Tx, incident_id: &str, reason: &str, actor: &str) {
     let Some(mut incident) = tx.view.incidents.get(incident_id).map(|i| i.row.clone()) else { return };
-    incident.closed = Some(Closed { actor: actor.to_owned(), reason: reason.to_owned(), at: tx.now.utc });
+    incident.closed = Some(IncidentClosure { actor: actor.to_owned(), reason: reason.to_owned(), at: tx.now.utc });
     tx.put_row(incident, "incident.closed");
 }
 

@@ -8,7 +8,7 @@ use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::decision::report::Tally;
 use crate::fleet::projection::liveness::{Board, is_fresh, is_settled, lease_stands, presence};
-use crate::fleet::projection::memory::Attached;
+use crate::fleet::projection::memory::AttachedTime;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::claims::{PLACES, differences, excess, implausible};
 use crate::fleet::tasks::transitions::{self, News, apply_event, may_suspend};
@@ -25,7 +25,7 @@ use crate::work::{AttemptReport, Live, PlaceNews, WorkState};
 /// Counts the time in which a robot is heard.
 fn count_attached_time(view: &mut FleetProjection, robot_id: &RobotId, board: &Board, now: &Now) {
     let heard = presence(board, robot_id, now) == Presence::Online;
-    let fresh = Attached { ms: 0, until: now.site, is_heard: heard };
+    let fresh = AttachedTime { ms: 0, until: now.site, is_heard: heard };
     let time = view.attached.entry(robot_id.clone()).or_insert(fresh);
     time.is_heard = heard;
     if heard {

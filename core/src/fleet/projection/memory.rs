@@ -27,7 +27,7 @@ pub struct Answers {
 
 /// Time in which a robot was heard and that no counter has yet.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Attached {
+pub struct AttachedTime {
     /// Milliseconds of site time.
     pub ms: u64,
     /// Up to when, site clock.

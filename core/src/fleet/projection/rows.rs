@@ -432,12 +432,12 @@ pub struct Incident {
     pub opened_unix_ms: Utc,
     /// A person has looked into it.
     #[serde(default)]
-    pub closed: Option<Closed>,
+    pub closed: Option<IncidentClosure>,
 }
 
-/// A person has looked into an incident.
+/// The closure of an incident: by whom, why and when.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Closed {
+pub struct IncidentClosure {
     /// Who closed it, by name; `fleet`: it was over by itself.
     pub actor: String,
     /// What was found.

@@ -2,7 +2,7 @@
 //!
 //! Every room of `fleet` reads it. Rows come in by `loading`; `index` keeps what is derived.
 
-use super::memory::{Agenda, Answers, Attached, Lasting, Unexplained, Waiting};
+use super::memory::{Agenda, Answers, AttachedTime, Lasting, Unexplained, Waiting};
 use super::queue::Queue;
 use super::refused::Refused;
 use super::rows::{
@@ -104,7 +104,7 @@ projection! {
         /// The attempt that a robot lists and no row knows, and since when, link clock.
         unknown: BTreeMap<RobotId, (AttemptId, crate::time::LinkTime)> = BTreeMap::new();
         /// Time in which robots were heard since it was last counted.
-        attached: BTreeMap<RobotId, Attached> = BTreeMap::new();
+        attached: BTreeMap<RobotId, AttachedTime> = BTreeMap::new();
         /// Entries of the feed whose items the store refused for good: passed over.
         unusable: BTreeSet<Seq> = BTreeSet::new();
         /// Decisions that the store refuses for good.
