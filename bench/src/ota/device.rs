@@ -8,7 +8,7 @@ use crate::figure::{Figure, median};
 use crate::fsync::place;
 use anyhow::{Context, ensure};
 use midshift_agent::sets::disk::DiskSets;
-use midshift_agent::sets::{CHUNK_BYTES, Sets, Wanted};
+use midshift_agent::sets::{CHUNK_BYTES, FileRef, Sets};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{self, Base, Encoded};
 use std::fs::File;
@@ -75,8 +75,8 @@ fn decode(base: Option<&[u8]>, way: &[u8], new: &[u8]) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn store_content(sets: &mut DiskSets, bytes: &[u8]) -> anyhow::Result<Wanted> {
-    let wanted = Wanted { digest: Digest::of_content(bytes), length: bytes.len() as u64 };
+fn store_content(sets: &mut DiskSets, bytes: &[u8]) -> anyhow::Result<FileRef> {
+    let wanted = FileRef { digest: Digest::of_content(bytes), length: bytes.len() as u64 };
     for (chunk, at) in bytes.chunks(CHUNK_BYTES as usize).zip((0..).step_by(CHUNK_BYTES as usize)) {
         sets.write(&wanted, at, chunk)?;
     }
@@ -93,7 +93,7 @@ fn applied(base: Option<&[u8]>, way: &[u8], new: &[u8], room: &Path) -> anyhow::
         let mut sets = DiskSets::open(folder.path())?;
         let base = base.map(|base| store_content(&mut sets, base)).transpose()?;
         let way = store_content(&mut sets, way)?;
-        let wanted = Wanted { digest: Digest::of_content(new), length: new.len() as u64 };
+        let wanted = FileRef { digest: Digest::of_content(new), length: new.len() as u64 };
         let begun = Instant::now();
         sets.decode(&wanted, base.map(|base| base.digest).as_ref(), &way)?;
         seconds.push(begun.elapsed().as_secs_f64());

@@ -4,7 +4,7 @@
 
 use crate::child::Child;
 use anyhow::{Context, bail, ensure};
-use midshift_agent::sets::Wanted;
+use midshift_agent::sets::FileRef;
 use midshift_agent::trust::Trust;
 use midshift_bundle::build;
 use midshift_bundle::folder::{Folder, Signed};
@@ -41,7 +41,7 @@ pub struct Release {
     /// As roll-outs name it.
     pub bundle: String,
     /// Its one file.
-    pub file: Wanted,
+    pub file: FileRef,
 }
 
 /// Writes bytes that no compression makes shorter.
@@ -99,7 +99,7 @@ impl Releases {
         fs::remove_dir_all(&draft)?;
         fs::remove_dir_all(&built)?;
         let component = manifest.components.first().context("a bundle without a component")?;
-        let file = Wanted { digest: component.digest, length: component.length };
+        let file = FileRef { digest: component.digest, length: component.length };
         Ok(Release { bundle: format!("{NAME}-{version}"), file })
     }
     /// Brings all of it to a server that has nothing.

@@ -9,7 +9,7 @@ use anyhow::Context;
 use midshift::robots::{AgentRun, Config, IdentityFlags, StopFlags};
 use midshift_agent::bulk::Bulk;
 use midshift_agent::dial::TcpDial;
-use midshift_agent::sets::Wanted;
+use midshift_agent::sets::FileRef;
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::update::io::{UpdateWorker, Worker};
 use midshift_agent::update::remote::GrpcRemote;
@@ -134,7 +134,7 @@ pub async fn play(part: Part, address: SocketAddr, stop: CancellationToken) -> a
         }
         Part::Bare { echo, stream, out } => bare(echo, stream, out, address, stop).await,
         Part::Fetch { server, sets, digest, length } => {
-            let wanted = Wanted { digest: digest.parse().ok().context("no digest")?, length };
+            let wanted = FileRef { digest: digest.parse().ok().context("no digest")?, length };
             let is_over = Arc::new(AtomicBool::new(false));
             let told = is_over.clone();
             answer_questions(address, stop.clone(), move |_| u64::from(told.load(Relaxed)))?;
@@ -315,7 +315,7 @@ async fn pull(server: SocketAddr, mut asked: watch::Receiver<bool>) -> anyhow::R
     }
 }
 
-async fn fetch(server: &str, sets: &Path, wanted: Wanted) -> anyhow::Result<()> {
+async fn fetch(server: &str, sets: &Path, wanted: FileRef) -> anyhow::Result<()> {
     let remote = GrpcRemote::new(Bulk::new(Arc::new(TcpDial::bulk(&midshift_cli::endpoint::uri(server), None)?)));
     let mut worker = UpdateWorker::new(Box::new(DiskSets::open(sets)?), Arc::new(remote));
     loop {

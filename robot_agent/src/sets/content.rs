@@ -2,7 +2,7 @@
 //!
 //! Invariant: a chunk is marked only after its bytes were synced, so a mark that survived a power cut tells the truth.
 
-use super::{CHUNK_BYTES, CHUNKS_UNSYNCED_MAX, Error, Wanted};
+use super::{CHUNK_BYTES, CHUNKS_UNSYNCED_MAX, Error, FileRef};
 use midshift_bundle::digest::Digest;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Seek, SeekFrom, Write};
@@ -69,7 +69,7 @@ impl Bitmap {
 /// A file on its way.
 #[derive(Debug)]
 pub(super) struct Part {
-    wanted: Wanted,
+    wanted: FileRef,
     file: File,
     path: PathBuf,
     map: PathBuf,
@@ -84,7 +84,7 @@ fn io_error(doing: &'static str) -> impl FnOnce(io::Error) -> Error {
 
 impl Part {
     /// Opens what is there of it, or begins.
-    pub(super) fn open(folder: &Path, wanted: &Wanted) -> Result<Self, Error> {
+    pub(super) fn open(folder: &Path, wanted: &FileRef) -> Result<Self, Error> {
         let path = folder.join(format!("{}.part", wanted.digest));
         let map = folder.join(format!("{}.map", wanted.digest));
         let opening = || {
@@ -104,7 +104,7 @@ impl Part {
         Ok(Self { wanted: *wanted, file, path, map, marks, unsynced: 0 })
     }
 
-    pub(super) fn wanted(&self) -> &Wanted {
+    pub(super) fn wanted(&self) -> &FileRef {
         &self.wanted
     }
 

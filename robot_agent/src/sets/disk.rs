@@ -14,7 +14,7 @@
 //! Invariant: a folder has the name of a set only when it is whole: it is made beside and renamed.
 
 use super::content::{Part, remove};
-use super::{CHUNK_BYTES, Error, Holdings, Sets, Wanted, base_name};
+use super::{CHUNK_BYTES, Error, FileRef, Holdings, Sets, base_name};
 use crate::launcher::boot::{BASE, BOOT};
 use crate::launcher::start_policy::TRIES_MAX;
 use crate::launcher::switch::Switch;
@@ -102,12 +102,12 @@ impl DiskSets {
         self.folder.join(set).join(name)
     }
 
-    fn has(&self, wanted: &Wanted) -> Result<bool, Error> {
+    fn has(&self, wanted: &FileRef) -> Result<bool, Error> {
         let there = optional(fs::metadata(self.content(&wanted.digest))).map_err(io_error("looking for content"))?;
         Ok(there.is_some_and(|file| file.len() == wanted.length))
     }
 
-    fn part(&mut self, wanted: &Wanted) -> Result<&mut Part, Error> {
+    fn part(&mut self, wanted: &FileRef) -> Result<&mut Part, Error> {
         if self.part.as_ref().is_none_or(|part| part.wanted() != wanted) {
             if let Some(mut other) = self.part.take() {
                 other.sync()?;
@@ -140,7 +140,7 @@ impl DiskSets {
     }
 
     /// Makes content beside and gives it its name once it was read back by the handle it was written with.
-    fn make(&self, wanted: &Wanted, base: Option<&Digest>, way: &Path, to: &Path) -> Result<(), Error> {
+    fn make(&self, wanted: &FileRef, base: Option<&Digest>, way: &Path, to: &Path) -> Result<(), Error> {
         let open = |digest: &Digest| {
             let file = optional(File::open(self.content(digest))).map_err(io_error("opening content"))?;
             file.ok_or(Error::Missing(*digest))
@@ -276,19 +276,19 @@ impl Sets for DiskSets {
         Ok(Holdings { switch, sets: self.sets()?, free_bytes })
     }
 
-    fn missing(&mut self, wanted: &Wanted) -> Result<Vec<Range<u64>>, Error> {
+    fn missing(&mut self, wanted: &FileRef) -> Result<Vec<Range<u64>>, Error> {
         if self.has(wanted)? { Ok(Vec::new()) } else { Ok(self.part(wanted)?.missing()) }
     }
 
-    fn write(&mut self, wanted: &Wanted, offset: u64, bytes: &[u8]) -> Result<(), Error> {
+    fn write(&mut self, wanted: &FileRef, offset: u64, bytes: &[u8]) -> Result<(), Error> {
         self.part(wanted)?.write(offset, bytes)
     }
 
-    fn sync(&mut self, wanted: &Wanted) -> Result<(), Error> {
+    fn sync(&mut self, wanted: &FileRef) -> Result<(), Error> {
         if self.has(wanted)? { Ok(()) } else { self.part(wanted)?.sync() }
     }
 
-    fn seal(&mut self, wanted: &Wanted) -> Result<(), Error> {
+    fn seal(&mut self, wanted: &FileRef) -> Result<(), Error> {
         if self.has(wanted)? {
             return Ok(());
         }
@@ -300,7 +300,7 @@ impl Sets for DiskSets {
         }
     }
 
-    fn decode(&mut self, wanted: &Wanted, base: Option<&Digest>, encoded: &Wanted) -> Result<(), Error> {
+    fn decode(&mut self, wanted: &FileRef, base: Option<&Digest>, encoded: &FileRef) -> Result<(), Error> {
         self.part = None;
         let (way, to) = (self.content(&encoded.digest), self.content(&wanted.digest));
         let made = if self.has(wanted)? { Ok(()) } else { self.make(wanted, base, &way, &to) };
@@ -308,12 +308,12 @@ impl Sets for DiskSets {
         made
     }
 
-    fn fetch_as_it_is(&mut self, wanted: &Wanted) -> Result<(), Error> {
+    fn fetch_as_it_is(&mut self, wanted: &FileRef) -> Result<(), Error> {
         let note = self.content(&wanted.digest).with_extension("plain");
         File::create(&note).and_then(|_| midshift_durable::sync_folder_of(&note)).map_err(io_error("noting a way"))
     }
 
-    fn is_fetched_as_it_is(&mut self, wanted: &Wanted) -> Result<bool, Error> {
+    fn is_fetched_as_it_is(&mut self, wanted: &FileRef) -> Result<bool, Error> {
         self.content(&wanted.digest).with_extension("plain").try_exists().map_err(io_error("looking for a note"))
     }
 
@@ -328,7 +328,7 @@ impl Sets for DiskSets {
         let folder = self.folder.join(id.to_string());
         if !self.sets()?.contains_key(&id) {
             for component in set.components.values() {
-                if !self.has(&Wanted { digest: component.digest, length: component.length })? {
+                if !self.has(&FileRef { digest: component.digest, length: component.length })? {
                     return Err(Error::Missing(component.digest));
                 }
             }
@@ -356,7 +356,7 @@ impl Sets for DiskSets {
         if component.kind == ComponentKind::Base { self.verify_base(&set) } else { Ok(()) }
     }
 
-    fn discard(&mut self, wanted: &Wanted) -> Result<(), Error> {
+    fn discard(&mut self, wanted: &FileRef) -> Result<(), Error> {
         let read = |path: &Path| Digest::of_reader(&mut File::open(path)?, COMPONENT_BYTES_MAX);
         let path = self.content(&wanted.digest);
         let read = match read(&path) {

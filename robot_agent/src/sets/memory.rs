@@ -5,7 +5,7 @@
 //! simulations.
 
 use super::content::Bitmap;
-use super::{Error, Holdings, Sets, Wanted, base_name};
+use super::{Error, FileRef, Holdings, Sets, base_name};
 use crate::launcher::PROGRAM;
 use crate::launcher::boot::{Boot, Image};
 use crate::launcher::switch::{FACTORY, Switch};
@@ -90,10 +90,10 @@ impl State {
     fn free(&self) -> u64 {
         self.room.map_or(u64::MAX, |room| room.saturating_sub(self.used()))
     }
-    fn has(&self, wanted: &Wanted) -> bool {
+    fn has(&self, wanted: &FileRef) -> bool {
         self.content.get(&wanted.digest).is_some_and(|bytes| bytes.len() as u64 == wanted.length)
     }
-    fn part(&mut self, wanted: &Wanted) -> Result<&mut Part, Error> {
+    fn part(&mut self, wanted: &FileRef) -> Result<&mut Part, Error> {
         if self.parts.get(&wanted.digest).is_none_or(|part| part.bytes.len() as u64 != wanted.length) {
             self.parts.remove(&wanted.digest);
             if wanted.length > self.free() {
@@ -164,12 +164,12 @@ impl Sets for MemorySets {
         Ok(Holdings { switch: state.switch.clone(), sets: state.sets.clone(), free_bytes: state.free() })
     }
 
-    fn missing(&mut self, wanted: &Wanted) -> Result<Vec<Range<u64>>, Error> {
+    fn missing(&mut self, wanted: &FileRef) -> Result<Vec<Range<u64>>, Error> {
         let mut state = self.state();
         if state.has(wanted) { Ok(Vec::new()) } else { Ok(state.part(wanted)?.written.missing()) }
     }
 
-    fn write(&mut self, wanted: &Wanted, offset: u64, bytes: &[u8]) -> Result<(), Error> {
+    fn write(&mut self, wanted: &FileRef, offset: u64, bytes: &[u8]) -> Result<(), Error> {
         let mut state = self.state();
         let part = state.part(wanted)?;
         let chunks = part.written.range(offset, bytes.len() as u64);
@@ -180,7 +180,7 @@ impl Sets for MemorySets {
         Ok(())
     }
 
-    fn sync(&mut self, wanted: &Wanted) -> Result<(), Error> {
+    fn sync(&mut self, wanted: &FileRef) -> Result<(), Error> {
         let mut state = self.state();
         if !state.has(wanted) {
             let part = state.part(wanted)?;
@@ -189,7 +189,7 @@ impl Sets for MemorySets {
         Ok(())
     }
 
-    fn seal(&mut self, wanted: &Wanted) -> Result<(), Error> {
+    fn seal(&mut self, wanted: &FileRef) -> Result<(), Error> {
         let mut state = self.state();
         if state.has(wanted) {
             return Ok(());
@@ -202,7 +202,7 @@ impl Sets for MemorySets {
         Ok(())
     }
 
-    fn decode(&mut self, wanted: &Wanted, base: Option<&Digest>, encoded: &Wanted) -> Result<(), Error> {
+    fn decode(&mut self, wanted: &FileRef, base: Option<&Digest>, encoded: &FileRef) -> Result<(), Error> {
         let mut state = self.state();
         let way = state.content.remove(&encoded.digest);
         if state.has(wanted) {
@@ -221,12 +221,12 @@ impl Sets for MemorySets {
         Ok(())
     }
 
-    fn fetch_as_it_is(&mut self, wanted: &Wanted) -> Result<(), Error> {
+    fn fetch_as_it_is(&mut self, wanted: &FileRef) -> Result<(), Error> {
         self.state().as_they_are.insert(wanted.digest);
         Ok(())
     }
 
-    fn is_fetched_as_it_is(&mut self, wanted: &Wanted) -> Result<bool, Error> {
+    fn is_fetched_as_it_is(&mut self, wanted: &FileRef) -> Result<bool, Error> {
         Ok(self.state().as_they_are.contains(&wanted.digest))
     }
 
@@ -273,7 +273,7 @@ impl Sets for MemorySets {
         if component.kind == ComponentKind::Base { state.verify_base(set) } else { Ok(()) }
     }
 
-    fn discard(&mut self, wanted: &Wanted) -> Result<(), Error> {
+    fn discard(&mut self, wanted: &FileRef) -> Result<(), Error> {
         self.state().content.retain(|digest, bytes| *digest != wanted.digest || Digest::of_content(bytes) == *digest);
         Ok(())
     }

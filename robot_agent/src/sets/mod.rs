@@ -55,7 +55,7 @@ impl Error {
 
 /// A file by what is in it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Wanted {
+pub struct FileRef {
     /// Of its bytes.
     pub digest: Digest,
     /// How many bytes it has.
@@ -88,10 +88,10 @@ impl Holdings {
         set.version.rsplit(' ').next().filter(|v| !v.is_empty()).map(str::to_owned)
     }
     /// The content of a component of kind config in a set.
-    pub fn settings(&self, name: &str, component: &str) -> Option<Wanted> {
+    pub fn settings(&self, name: &str, component: &str) -> Option<FileRef> {
         let set = self.set(name)?;
         let component = set.components.get(component).filter(|c| c.kind == ComponentKind::Config)?;
-        Some(Wanted { digest: component.digest, length: component.length })
+        Some(FileRef { digest: component.digest, length: component.length })
     }
     /// Other content of the same component, of the sets that run and are kept: what a patch may be from.
     pub fn bases(&self, component: &Component) -> Vec<Digest> {
@@ -121,39 +121,39 @@ pub trait Sets: Send {
     ///
     /// # Errors
     /// The disk's.
-    fn missing(&mut self, wanted: &Wanted) -> Result<Vec<Range<u64>>, Error>;
+    fn missing(&mut self, wanted: &FileRef) -> Result<Vec<Range<u64>>, Error>;
     /// Takes bytes that begin and end at chunks, or at the end of the file. Durable after [`Sets::sync`].
     ///
     /// # Errors
     /// The disk's; `InvalidInput` for bytes that do not lie so.
-    fn write(&mut self, wanted: &Wanted, offset: u64, bytes: &[u8]) -> Result<(), Error>;
+    fn write(&mut self, wanted: &FileRef, offset: u64, bytes: &[u8]) -> Result<(), Error>;
     /// What was written is durable, and stays if the power goes.
     ///
     /// # Errors
     /// The disk's.
-    fn sync(&mut self, wanted: &Wanted) -> Result<(), Error>;
+    fn sync(&mut self, wanted: &FileRef) -> Result<(), Error>;
     /// Checks the whole file from the same handle that was written and makes it content. Nothing to do if it is that
     /// already.
     ///
     /// # Errors
     /// [`Error::Corrupt`]: all of it is thrown away.
-    fn seal(&mut self, wanted: &Wanted) -> Result<(), Error>;
+    fn seal(&mut self, wanted: &FileRef) -> Result<(), Error>;
     /// Makes content of a shorter way to it that is there whole, from `base` if it is a patch, and checks it as
     /// [`Sets::seal`] does. The shorter way goes, whatever comes of it. Nothing to do if the content is there already.
     ///
     /// # Errors
     /// [`Error::Corrupt`] if it does not lead to what is wanted; a base that is not there; the disk's.
-    fn decode(&mut self, wanted: &Wanted, base: Option<&Digest>, encoded: &Wanted) -> Result<(), Error>;
+    fn decode(&mut self, wanted: &FileRef, base: Option<&Digest>, encoded: &FileRef) -> Result<(), Error>;
     /// No shorter way to this file is tried any more; durable, until the file is there.
     ///
     /// # Errors
     /// The disk's.
-    fn fetch_as_it_is(&mut self, wanted: &Wanted) -> Result<(), Error>;
+    fn fetch_as_it_is(&mut self, wanted: &FileRef) -> Result<(), Error>;
     /// Whether [`Sets::fetch_as_it_is`] was said of it.
     ///
     /// # Errors
     /// The disk's.
-    fn is_fetched_as_it_is(&mut self, wanted: &Wanted) -> Result<bool, Error>;
+    fn is_fetched_as_it_is(&mut self, wanted: &FileRef) -> Result<bool, Error>;
     /// Content in memory, for small files.
     ///
     /// # Errors
@@ -181,7 +181,7 @@ pub trait Sets: Send {
     ///
     /// # Errors
     /// The disk's.
-    fn discard(&mut self, wanted: &Wanted) -> Result<(), Error>;
+    fn discard(&mut self, wanted: &FileRef) -> Result<(), Error>;
     /// Puts the page of a set and its files in place of what lies there, one by one, of content that is there, and
     /// reads it back.
     ///

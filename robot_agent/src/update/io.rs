@@ -5,7 +5,7 @@
 
 use super::jobs::{Done, Failure, Job};
 use super::migration;
-use crate::sets::{self, CHUNK_BYTES, Sets, Wanted};
+use crate::sets::{self, CHUNK_BYTES, FileRef, Sets};
 use async_trait::async_trait;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding::{ENCODED_BYTES_MAX, ENCODED_BYTES_MIN};
@@ -40,7 +40,7 @@ pub trait Remote: fmt::Debug + Send + Sync {
     /// A range of content, or of a shorter way to it. `NotFound`: there is none.
     async fn range(&self, digest: &Digest, range: Range<u64>) -> io::Result<Pieces>;
     /// How content is best fetched by a robot that has `bases`. A repository without shorter ways says: as it is.
-    async fn way(&self, _wanted: &Wanted, _bases: &[Digest]) -> io::Result<Way> {
+    async fn way(&self, _wanted: &FileRef, _bases: &[Digest]) -> io::Result<Way> {
         Ok(Way::AsItIs)
     }
 }
@@ -55,7 +55,7 @@ pub enum Way {
         /// What the robot has.
         base: Option<Digest>,
         /// What is fetched.
-        encoded: Wanted,
+        encoded: FileRef,
     },
 }
 
@@ -248,7 +248,7 @@ impl UpdateWorker {
     /// Has all of a set's bytes anew that are not what was signed, and puts them in place.
     async fn mend(&self, set: SetManifest, leave: &CancellationToken) -> Done {
         for component in set.components.values() {
-            let wanted = Wanted { digest: component.digest, length: component.length };
+            let wanted = FileRef { digest: component.digest, length: component.length };
             if let Err(error) = self.on_disk(move |sets| sets.discard(&wanted)).await {
                 return Done::Failed(of_disk(&error));
             }
@@ -259,7 +259,7 @@ impl UpdateWorker {
         self.held(move |sets| sets.mend(&set)).await
     }
 
-    async fn manifest(&self, wanted: Wanted) -> Done {
+    async fn manifest(&self, wanted: FileRef) -> Done {
         match self.on_disk(move |sets| sets.read(&wanted.digest, MANIFEST_BYTES_MAX as u64)).await {
             Ok(bytes) => match Manifest::from_bytes(&bytes) {
                 Ok(manifest) => Done::Manifest { manifest: Box::new(manifest), bytes },
@@ -272,7 +272,7 @@ impl UpdateWorker {
     /// Has a file by the shortest way that leads to it. One that was begun as it is goes on so.
     async fn fetch(
         &self,
-        wanted: Wanted,
+        wanted: FileRef,
         bases: &[Digest],
         pace: &mut Pace,
         leave: &CancellationToken,
@@ -291,7 +291,7 @@ impl UpdateWorker {
     /// not tried again.
     async fn fetch_shorter(
         &self,
-        wanted: Wanted,
+        wanted: FileRef,
         bases: &[Digest],
         pace: &mut Pace,
         leave: &CancellationToken,
@@ -313,7 +313,7 @@ impl UpdateWorker {
     }
 
     /// A shorter way that the server names and that can lead there.
-    async fn shorter(&self, wanted: Wanted, bases: &[Digest]) -> Result<Option<(Option<Digest>, Wanted)>, Stop> {
+    async fn shorter(&self, wanted: FileRef, bases: &[Digest]) -> Result<Option<(Option<Digest>, FileRef)>, Stop> {
         let Way::Shorter { base, encoded } = self.remote.way(&wanted, bases).await.map_err(unreached)? else {
             return Ok(None);
         };
@@ -323,7 +323,7 @@ impl UpdateWorker {
     }
 
     /// Fetches what is missing and checks the whole.
-    async fn fetch_whole(&self, wanted: Wanted, pace: &mut Pace, leave: &CancellationToken) -> Result<(), Stop> {
+    async fn fetch_whole(&self, wanted: FileRef, pace: &mut Pace, leave: &CancellationToken) -> Result<(), Stop> {
         for gap in self.on_disk(move |sets| sets.missing(&wanted)).await.map_err(stopped)? {
             let mut from = gap.start;
             while from < gap.end {
@@ -349,7 +349,7 @@ impl UpdateWorker {
     }
 
     /// Whole chunks go to the disk as they are complete; what is left of the last is dropped if the way breaks.
-    async fn fetch_range(&self, wanted: Wanted, range: Range<u64>, pace: &mut Pace) -> Result<(), Stop> {
+    async fn fetch_range(&self, wanted: FileRef, range: Range<u64>, pace: &mut Pace) -> Result<(), Stop> {
         let mut pieces =
             self.remote.range(&wanted.digest, range.clone()).await.map_err(|error| match error.kind() {
                 io::ErrorKind::NotFound => Stop::Gone(error.to_string()),
@@ -387,7 +387,7 @@ impl UpdateWorker {
         if at == range.end { Ok(()) } else { Err(unreached("the bytes ended early")) }
     }
 
-    async fn synced(&self, wanted: Wanted) -> Result<(), Stop> {
+    async fn synced(&self, wanted: FileRef) -> Result<(), Stop> {
         self.on_disk(move |sets| sets.sync(&wanted)).await.map_err(stopped)
     }
 }

@@ -3,7 +3,7 @@
 //! Invariant: each side effect of an update is a [`Job`]; at most one is under way.
 
 use crate::launcher::switch::Switch;
-use crate::sets::{Holdings, Wanted};
+use crate::sets::{FileRef, Holdings};
 use crate::storage::DueMigration;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::Manifest;
@@ -30,7 +30,7 @@ pub enum Job {
     /// Have this content, whole and checked.
     Fetch {
         /// Digest and length of the content.
-        wanted: Wanted,
+        wanted: FileRef,
         /// Content that a patch may be from: the same component in other sets, the running one first.
         bases: Vec<Digest>,
         /// Bytes a second; 0: as fast as it goes.
@@ -39,7 +39,7 @@ pub enum Job {
     /// Fetch and read a manifest.
     Manifest {
         /// Digest and length of the manifest.
-        wanted: Wanted,
+        wanted: FileRef,
     },
     /// Make a set of what is there and read it back.
     Stage(Box<SetManifest>),

@@ -4,7 +4,7 @@
 //! [`super::io`].
 
 use super::io::{Pieces, Remote, Way};
-use crate::sets::Wanted;
+use crate::sets::FileRef;
 use crate::transport::bulk::{Bulk, Lease, SILENCE, silent};
 use async_trait::async_trait;
 use midshift_bundle::digest::Digest;
@@ -58,7 +58,7 @@ impl Remote for GrpcRemote {
         }
     }
 
-    async fn way(&self, wanted: &Wanted, bases: &[Digest]) -> io::Result<Way> {
+    async fn way(&self, wanted: &FileRef, bases: &[Digest]) -> io::Result<Way> {
         let lease = self.bulk.lease().await?;
         let base_digests = bases.iter().take(limits::ENCODING_BASES_MAX).map(Digest::to_string).collect();
         let request = GetEncodingRequest { digest: wanted.digest.to_string(), base_digests };
@@ -99,7 +99,7 @@ impl Remote for GrpcRemote {
 
 /// What an answer says; one that makes no sense is none.
 fn way(answer: &GetEncodingResponse) -> Way {
-    let encoded = |digest: Digest| Wanted { digest, length: answer.encoded_length };
+    let encoded = |digest: Digest| FileRef { digest, length: answer.encoded_length };
     let base = match answer.encoding() {
         Encoding::Zstd => Ok(None),
         Encoding::ZstdPatch => answer.base_digest.parse().map(Some),

@@ -1,7 +1,7 @@
 //! Sets in a folder on a disk that may have no room left: what must add to it is refused, whatever else goes on.
 
 use midshift_agent::sets::disk::DiskSets;
-use midshift_agent::sets::{Error, Holdings, Sets, Wanted};
+use midshift_agent::sets::{Error, FileRef, Holdings, Sets};
 use midshift_agent::switch::Switch;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::set::SetManifest;
@@ -58,7 +58,7 @@ impl Sets for CrowdedSets {
         Ok(Holdings { free_bytes, ..holdings })
     }
 
-    fn missing(&mut self, wanted: &Wanted) -> Result<Vec<Range<u64>>, Error> {
+    fn missing(&mut self, wanted: &FileRef) -> Result<Vec<Range<u64>>, Error> {
         let missing = self.disk().missing(wanted)?;
         if !missing.is_empty() {
             self.find_room("opening a download")?;
@@ -66,30 +66,30 @@ impl Sets for CrowdedSets {
         Ok(missing)
     }
 
-    fn write(&mut self, wanted: &Wanted, offset: u64, bytes: &[u8]) -> Result<(), Error> {
+    fn write(&mut self, wanted: &FileRef, offset: u64, bytes: &[u8]) -> Result<(), Error> {
         self.find_room("writing a download")?;
         self.disk().write(wanted, offset, bytes)
     }
 
-    fn sync(&mut self, wanted: &Wanted) -> Result<(), Error> {
+    fn sync(&mut self, wanted: &FileRef) -> Result<(), Error> {
         self.disk().sync(wanted)
     }
 
-    fn seal(&mut self, wanted: &Wanted) -> Result<(), Error> {
+    fn seal(&mut self, wanted: &FileRef) -> Result<(), Error> {
         self.disk().seal(wanted)
     }
 
-    fn decode(&mut self, wanted: &Wanted, base: Option<&Digest>, encoded: &Wanted) -> Result<(), Error> {
+    fn decode(&mut self, wanted: &FileRef, base: Option<&Digest>, encoded: &FileRef) -> Result<(), Error> {
         self.find_room("making content")?;
         self.disk().decode(wanted, base, encoded)
     }
 
-    fn fetch_as_it_is(&mut self, wanted: &Wanted) -> Result<(), Error> {
+    fn fetch_as_it_is(&mut self, wanted: &FileRef) -> Result<(), Error> {
         self.find_room("noting a way")?;
         self.disk().fetch_as_it_is(wanted)
     }
 
-    fn is_fetched_as_it_is(&mut self, wanted: &Wanted) -> Result<bool, Error> {
+    fn is_fetched_as_it_is(&mut self, wanted: &FileRef) -> Result<bool, Error> {
         self.disk().is_fetched_as_it_is(wanted)
     }
 
@@ -113,7 +113,7 @@ impl Sets for CrowdedSets {
         self.disk().check(set, file)
     }
 
-    fn discard(&mut self, wanted: &Wanted) -> Result<(), Error> {
+    fn discard(&mut self, wanted: &FileRef) -> Result<(), Error> {
         self.disk().discard(wanted)
     }
 

@@ -1,7 +1,7 @@
 //! Releases for a robot on the bench: a repository with throw-away keys, and the bytes of its bundles.
 
 use async_trait::async_trait;
-use midshift_agent::sets::Wanted;
+use midshift_agent::sets::FileRef;
 use midshift_agent::update::UpdateConfig;
 use midshift_agent::update::io::{Pieces, Remote, Way};
 use midshift_bundle::digest::Digest;
@@ -272,15 +272,15 @@ impl Releases {
         self.shelf().corrupt = corrupt;
     }
     /// Has bytes that no release lists.
-    pub fn hold(&self, bytes: &[u8]) -> Wanted {
+    pub fn hold(&self, bytes: &[u8]) -> FileRef {
         self.shelf().bytes.insert(Digest::of_content(bytes), bytes.to_vec());
-        Wanted { digest: Digest::of_content(bytes), length: bytes.len() as u64 }
+        FileRef { digest: Digest::of_content(bytes), length: bytes.len() as u64 }
     }
     pub fn drop_bytes(&self, digest: &Digest) {
         self.shelf().bytes.remove(digest);
     }
     /// Says this of ways to a file from now on, one after the other.
-    pub fn ways(&self, wanted: &Wanted, mut ways: Vec<Way>) {
+    pub fn ways(&self, wanted: &FileRef, mut ways: Vec<Way>) {
         ways.reverse();
         self.shelf().ways.insert(wanted.digest, ways);
     }
@@ -295,7 +295,7 @@ impl Releases {
 
 #[async_trait]
 impl Remote for Releases {
-    async fn way(&self, wanted: &Wanted, bases: &[Digest]) -> io::Result<Way> {
+    async fn way(&self, wanted: &FileRef, bases: &[Digest]) -> io::Result<Way> {
         let mut shelf = self.shelf();
         if shelf.cut {
             return Err(io::ErrorKind::NotConnected.into());

@@ -7,7 +7,7 @@ use hyper_util::rt::TokioIo;
 use midshift_agent::bulk::{Bulk, IDLE, SILENCE};
 use midshift_agent::dial::{self, Dial, TcpDial};
 use midshift_agent::sets::memory::MemorySets;
-use midshift_agent::sets::{CHUNK_BYTES, Sets, Wanted};
+use midshift_agent::sets::{CHUNK_BYTES, FileRef, Sets};
 use midshift_agent::update::io::{Remote, UpdateWorker, Way, Worker};
 use midshift_agent::update::remote::GrpcRemote;
 use midshift_agent::update::{Done, Failure, Job};
@@ -245,14 +245,14 @@ impl Bench {
     /// What the robot makes of an answer about ways.
     async fn way(&self, answer: GetEncodingResponse) -> Way {
         *self.shop.encoding.lock().expect("not poisoned") = answer;
-        let wanted = Wanted { digest: Digest::of_content(b"new"), length: 1_000 };
+        let wanted = FileRef { digest: Digest::of_content(b"new"), length: 1_000 };
         self.remote.way(&wanted, &[Digest::of_content(b"old")]).await.expect("answers")
     }
     fn connections(&self) -> (usize, usize) {
         (*self.open.borrow(), *self.dialed.borrow())
     }
     /// All of a file, or the bytes up to an error and its kind.
-    async fn read(&self, wanted: Wanted) -> (Vec<u8>, Option<ErrorKind>) {
+    async fn read(&self, wanted: FileRef) -> (Vec<u8>, Option<ErrorKind>) {
         let mut bytes = Vec::new();
         let mut pieces = match self.remote.range(&wanted.digest, 0..wanted.length).await {
             Ok(pieces) => pieces,
@@ -271,9 +271,9 @@ impl Bench {
     }
 }
 
-fn program(bundle: &Bundle) -> Wanted {
+fn program(bundle: &Bundle) -> FileRef {
     let component = &bundle.manifest.components[0];
-    Wanted { digest: component.digest, length: component.length }
+    FileRef { digest: component.digest, length: component.length }
 }
 
 async fn work(worker: &mut UpdateWorker, job: Job) -> Done {
@@ -286,7 +286,7 @@ async fn a_release_comes_over_the_wire_whole() {
     let bundle = bench.releases.release("1.0.0");
     let mut sets = MemorySets::new();
     let mut worker = UpdateWorker::new(Box::new(sets.clone()), bench.remote.clone());
-    let manifest = Wanted { digest: bundle.digest, length: bundle.length };
+    let manifest = FileRef { digest: bundle.digest, length: bundle.length };
     let Done::Manifest { manifest: read, bytes } = work(&mut worker, Job::Manifest { wanted: manifest }).await else {
         panic!("no manifest")
     };
@@ -321,7 +321,7 @@ async fn what_is_not_there_is_told_from_a_server_that_does_not_answer() {
     let bench = Bench::new();
     let bundle = bench.releases.release("1.0.0");
     assert_eq!(bench.remote.metadata("7.root.json").await.expect("answers"), None);
-    let nothing = Wanted { digest: Digest::of_content(b"of nobody"), length: 10 };
+    let nothing = FileRef { digest: Digest::of_content(b"of nobody"), length: 10 };
     assert_eq!(bench.read(nothing).await, (vec![], Some(ErrorKind::NotFound)));
     bench.server_is(Wrong::Refuses);
     assert!(bench.remote.metadata("7.root.json").await.is_err());
@@ -409,7 +409,7 @@ async fn a_shorter_way_is_asked_for_with_what_is_there_and_an_answer_without_sen
         encoded_digest: way.to_string(),
         encoded_length: 7,
     };
-    let encoded = Wanted { digest: way, length: 7 };
+    let encoded = FileRef { digest: way, length: 7 };
     assert_eq!(bench.way(answer.clone()).await, Way::Shorter { base: Some(old), encoded });
     let zstd = GetEncodingResponse { encoding: Encoding::Zstd.into(), ..answer.clone() };
     assert_eq!(bench.way(zstd).await, Way::Shorter { base: None, encoded });

@@ -13,7 +13,7 @@ use midshift_agent::dial::{self, Cut, Dial};
 use midshift_agent::memory::MemoryStore;
 use midshift_agent::session::{AgentConfig, Error, Lines, Updates, run};
 use midshift_agent::sets::memory::MemorySets;
-use midshift_agent::sets::{Sets, Wanted};
+use midshift_agent::sets::{FileRef, Sets};
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::store::{Op, Store};
 use midshift_agent::update::SoftwareRow;
@@ -433,7 +433,7 @@ async fn a_robot_on_its_file_takes_work_over_the_wire_and_does_it() {
 fn one_set() -> MemorySets {
     let mut sets = MemorySets::new();
     let content = b"settings 1.1.0";
-    let wanted = Wanted { digest: Digest::of_content(content), length: content.len() as u64 };
+    let wanted = FileRef { digest: Digest::of_content(content), length: content.len() as u64 };
     sets.write(&wanted, 0, content).expect("writes");
     sets.sync(&wanted).expect("syncs");
     sets.seal(&wanted).expect("seals");

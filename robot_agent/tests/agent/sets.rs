@@ -3,7 +3,7 @@
 use midshift_agent::launcher::{PROGRAM, SWITCH};
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sets::memory::MemorySets;
-use midshift_agent::sets::{CHUNK_BYTES, CHUNKS_UNSYNCED_MAX, Error, Sets, Wanted};
+use midshift_agent::sets::{CHUNK_BYTES, CHUNKS_UNSYNCED_MAX, Error, FileRef, Sets};
 use midshift_agent::switch::Switch;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::encoding;
@@ -86,11 +86,11 @@ pub fn bomb() -> Vec<u8> {
     bomb
 }
 
-pub fn wanted(content: &[u8]) -> Wanted {
-    Wanted { digest: Digest::of_content(content), length: content.len() as u64 }
+pub fn wanted(content: &[u8]) -> FileRef {
+    FileRef { digest: Digest::of_content(content), length: content.len() as u64 }
 }
 
-pub fn put_content(sets: &mut dyn Sets, content: &[u8]) -> Wanted {
+pub fn put_content(sets: &mut dyn Sets, content: &[u8]) -> FileRef {
     let wanted = wanted(content);
     for range in sets.missing(&wanted).expect("tells") {
         let part = &content[range.start as usize..range.end as usize];
@@ -392,7 +392,7 @@ fn sizes_around_2_31_and_2_32_are_files_like_others() {
     let folder = tempfile::tempdir().expect("a folder");
     let mut sets = DiskSets::open(folder.path()).expect("opens");
     for length in [(1_u64 << 31) - 1, 1 << 31, (1 << 31) + 1, (1 << 32) - 1, 1 << 32, (1 << 32) + 1] {
-        let wanted = Wanted { digest: Digest::of_content(&length.to_be_bytes()), length };
+        let wanted = FileRef { digest: Digest::of_content(&length.to_be_bytes()), length };
         let last = (length - 1) / CHUNK_BYTES * CHUNK_BYTES;
         sets.write(&wanted, last, &bytes(1, length - last)).expect("writes");
         sets.sync(&wanted).expect("syncs");
@@ -435,9 +435,9 @@ fn a_way_that_leads_elsewhere_makes_no_content_and_goes() {
             (tampered, Some(base), new_one),
             (right.clone(), Some(other), new_one),
             (right.clone(), None, new_one),
-            (right.clone(), Some(base), Wanted { length: new_one.length - 1, ..new_one }),
-            (right.clone(), Some(base), Wanted { length: new_one.length + 1, ..new_one }),
-            (right, Some(base), Wanted { digest: Digest::of_content(b"another"), ..new_one }),
+            (right.clone(), Some(base), FileRef { length: new_one.length - 1, ..new_one }),
+            (right.clone(), Some(base), FileRef { length: new_one.length + 1, ..new_one }),
+            (right, Some(base), FileRef { digest: Digest::of_content(b"another"), ..new_one }),
             (bomb(), None, new_one),
         ];
         for (way, base, wanted) in cases {

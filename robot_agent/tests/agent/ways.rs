@@ -3,7 +3,7 @@
 use crate::release::Releases;
 use crate::sets::{noise, patch, wanted};
 use midshift_agent::sets::memory::MemorySets;
-use midshift_agent::sets::{CHUNK_BYTES, Sets, Wanted};
+use midshift_agent::sets::{CHUNK_BYTES, FileRef, Sets};
 use midshift_agent::update::io::{UpdateWorker, Way, Worker};
 use midshift_agent::update::{Done, Failure, Job};
 use midshift_bundle::digest::Digest;
@@ -45,7 +45,7 @@ impl Bench {
         worker.work(job, CancellationToken::new()).await
     }
     fn has_new(&self) -> bool {
-        let Wanted { digest, length } = wanted(&self.new);
+        let FileRef { digest, length } = wanted(&self.new);
         self.sets.clone().read(&digest, length).is_ok_and(|bytes| bytes == self.new)
     }
 }
@@ -110,9 +110,9 @@ async fn an_answer_that_cannot_be_meant_is_not_followed() {
     let (new, patch) = (wanted(&bench.new), wanted(&bench.patch));
     let cases = [
         Way::Shorter { base: Some(Digest::of_content(b"of nobody")), encoded: patch },
-        Way::Shorter { base, encoded: Wanted { length: new.length, ..patch } },
-        Way::Shorter { base, encoded: Wanted { length: 0, ..patch } },
-        Way::Shorter { base, encoded: Wanted { length: 100, ..new } },
+        Way::Shorter { base, encoded: FileRef { length: new.length, ..patch } },
+        Way::Shorter { base, encoded: FileRef { length: 0, ..patch } },
+        Way::Shorter { base, encoded: FileRef { length: 100, ..new } },
     ];
     for way in cases {
         let bench = Bench::new();

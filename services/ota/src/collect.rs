@@ -20,18 +20,18 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 /// Since when nothing names a file, milliseconds of serving time by its digest: beside the folder of files.
 const UNNAMED: &str = "unnamed.json";
 
-/// What is still needed, and when that was said.
+/// The bundles that rows name, and when that was so.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Named {
+pub struct NamedBundles {
     /// Bundles that rows name.
     pub bundles: BTreeSet<BundleId>,
     /// Serving time, milliseconds of the site clock.
     pub served_ms: u64,
 }
 
-/// What one pass came to.
+/// The outcome of one pass of the collector.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Collected {
+pub struct CollectionOutcome {
     /// Files that were taken away, whole or not.
     pub files: u64,
     /// Their bytes.
@@ -48,7 +48,7 @@ pub struct Pass {
     /// UTC of the wall.
     pub at: Utc,
     /// What it came to.
-    pub collected: Collected,
+    pub collected: CollectionOutcome,
 }
 
 /// What is remembered of unnamed files.
@@ -106,9 +106,9 @@ impl Collector {
         &self,
         content: &dyn Content,
         repository: &Repository,
-        named: &Named,
+        named: &NamedBundles,
         at: Utc,
-    ) -> Result<Collected, Error> {
+    ) -> Result<CollectionOutcome, Error> {
         let (newest, guard) = repository.still().await?;
         let mut kept = newest.map(|newest| newest.digests().clone()).unwrap_or_default();
         for bundle in &named.bundles {
@@ -119,7 +119,7 @@ impl Collector {
         let path = self.path.clone();
         // Another process may have made the pass before.
         marks.since = blocking(move || read(&path)).await?;
-        let mut done = Collected::default();
+        let mut done = CollectionOutcome::default();
         let served_ms = named.served_ms;
         let mut since = BTreeMap::new();
         let seen = marks.touched;
@@ -162,7 +162,7 @@ impl Collector {
     }
 }
 
-impl Collected {
+impl CollectionOutcome {
     /// Says it to whoever watches the server.
     pub fn report_pass(&self, at: Utc) {
         metrics::counter!("midshift_ota_collected_total", "what" => "file").increment(self.files);

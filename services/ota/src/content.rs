@@ -4,11 +4,11 @@
 //! no more than the quota lies here, and the disk keeps its spare bytes. Whether a file may be handed out, and when one is needed no
 //! more, is not decided here.
 
-mod held;
 mod shared;
+mod storage;
 
 pub use crate::disk::Error;
-pub use held::{Content, Fill, Held, Reader, Room, Stored, Wanted};
+pub use storage::{Completeness, Content, FileRef, Fill, Reader, Room, StoredFile};
 
 use crate::disk::{at, sync_folder};
 use crate::folder::Gate;
@@ -42,7 +42,7 @@ struct Mark {
 }
 
 /// A file that is being brought.
-struct Part {
+struct PartialFile {
     mark: Mark,
     written: u64,
     /// None: not opened since the start, or a write failed. Only `mark.durable` bytes count then.
@@ -50,22 +50,22 @@ struct Part {
 }
 
 struct Entry {
-    part: Arc<Mutex<Part>>,
+    part: Arc<Mutex<PartialFile>>,
     touched: u64,
-    changed: Changed,
+    changed: FileTime,
 }
 
 struct Whole {
     length: u64,
     touched: u64,
-    changed: Changed,
+    changed: FileTime,
 }
 
 /// When a file was changed last, as its file system says: seconds and nanoseconds. Only compared with itself. Zeros if nobody asks.
-type Changed = (i64, i64);
+type FileTime = (i64, i64);
 
-/// Whose hand is on the folder.
-enum Hand {
+/// How this process may use the folder.
+enum FolderAccess {
     /// Of one process: what it remembers is what is there.
     Alone,
     /// Of one of several: what is there may be another's, and is looked at anew at each turn.
@@ -107,7 +107,7 @@ impl Shelf {
 struct Inner {
     path: PathBuf,
     room: Room,
-    hand: Hand,
+    hand: FolderAccess,
     shelf: Mutex<Shelf>,
 }
 
@@ -124,10 +124,10 @@ impl DiskContent {
     /// If it cannot be read or mended.
     pub fn open(path: &Path, room: Room) -> Result<Self, Error> {
         fs::create_dir_all(path).map_err(at("making", path))?;
-        Self::mended(path, room, Hand::Alone)
+        Self::mended(path, room, FolderAccess::Alone)
     }
 
-    fn mended(path: &Path, room: Room, hand: Hand) -> Result<Self, Error> {
+    fn mended(path: &Path, room: Room, hand: FolderAccess) -> Result<Self, Error> {
         let mut shelf = Shelf::default();
         let mut names = Vec::new();
         for entry in fs::read_dir(path).map_err(at("reading", path))? {
@@ -136,7 +136,7 @@ impl DiskContent {
             names.extend(entry.file_name().into_string().ok().map(|name| (name, length)));
         }
         let marks: Vec<String> = names.iter().map(|(name, _)| name).filter(|n| n.ends_with(".mark")).cloned().collect();
-        let changed = Changed::default();
+        let changed = FileTime::default();
         for (name, length) in names {
             if let Ok(digest) = name.parse::<Digest>() {
                 shelf.whole.insert(digest, Whole { length, touched: 0, changed });
@@ -144,7 +144,7 @@ impl DiskContent {
             } else if let Some(digest) = name.strip_suffix(".part").and_then(|n| n.parse::<Digest>().ok())
                 && let Some(mark) = read_mark(path, digest, length)
             {
-                let part = Part { mark, written: mark.durable, open: None };
+                let part = PartialFile { mark, written: mark.durable, open: None };
                 shelf.parts.insert(digest, Entry { part: Arc::new(Mutex::new(part)), touched: 0, changed });
                 shelf.used += mark.durable;
             } else if !name.ends_with(".mark") {
@@ -167,9 +167,9 @@ impl DiskContent {
         work: impl FnOnce(&Inner) -> Result<T, Error> + Send + 'static,
     ) -> Result<T, Error> {
         let turn = match &self.inner.hand {
-            Hand::Alone => None,
-            Hand::Shared(sharing) => Some(sharing.gate.take_turn().await?),
-            Hand::Reading => return Err(Error::ReadOnly { path: self.inner.path.clone() }),
+            FolderAccess::Alone => None,
+            FolderAccess::Shared(sharing) => Some(sharing.gate.take_turn().await?),
+            FolderAccess::Reading => return Err(Error::ReadOnly { path: self.inner.path.clone() }),
         };
         let inner = self.inner.clone();
         blocking(move || {
@@ -189,16 +189,16 @@ impl DiskContent {
 #[async_trait]
 impl Content for DiskContent {
     async fn length(&self, digest: Digest) -> Result<Option<u64>, Error> {
-        if matches!(self.inner.hand, Hand::Alone) {
+        if matches!(self.inner.hand, FolderAccess::Alone) {
             return Ok(self.inner.shelf().whole.get(&digest).map(|whole| whole.length));
         }
         let inner = self.inner.clone();
         blocking(move || inner.length_there(digest)).await
     }
-    async fn append(&self, file: Wanted, offset: u64, piece: Bytes) -> Result<(), Error> {
+    async fn append(&self, file: FileRef, offset: u64, piece: Bytes) -> Result<(), Error> {
         self.in_turn(move |inner| inner.append(file, offset, &piece)).await
     }
-    async fn settle(&self, file: Wanted) -> Result<Held, Error> {
+    async fn settle(&self, file: FileRef) -> Result<Completeness, Error> {
         self.in_turn(move |inner| inner.settle(file)).await
     }
     async fn read(&self, digest: Digest, range: Range<u64>) -> Result<Option<Reader>, Error> {
@@ -213,8 +213,8 @@ impl Content for DiskContent {
         }
         Ok(Some(Box::new(AsyncReadExt::take(tokio::fs::File::from_std(file), length))))
     }
-    async fn list(&self) -> Result<Vec<Stored>, Error> {
-        if matches!(self.inner.hand, Hand::Alone) {
+    async fn list(&self) -> Result<Vec<StoredFile>, Error> {
+        if matches!(self.inner.hand, FolderAccess::Alone) {
             return Ok(self.inner.list());
         }
         self.in_turn(|inner| Ok(inner.list())).await
@@ -256,7 +256,7 @@ impl Inner {
         sync_folder(&self.path)?;
         let mut shelf = self.shelf();
         if !shelf.parts.contains_key(&digest) && !shelf.whole.contains_key(&digest) {
-            shelf.whole.insert(digest, Whole { length, touched: 0, changed: Changed::default() });
+            shelf.whole.insert(digest, Whole { length, touched: 0, changed: FileTime::default() });
             shelf.used += length;
         }
         Ok(shelf.whole.contains_key(&digest))
@@ -264,7 +264,7 @@ impl Inner {
 
     fn open_at(&self, digest: Digest, offset: u64) -> Result<Option<File>, Error> {
         // Who shares the folder asks the disk.
-        let is_gone = |shelf: &Shelf| matches!(self.hand, Hand::Alone) && !shelf.whole.contains_key(&digest);
+        let is_gone = |shelf: &Shelf| matches!(self.hand, FolderAccess::Alone) && !shelf.whole.contains_key(&digest);
         let is_unknown = is_gone(&self.shelf());
         if is_unknown && !self.take_back(digest)? {
             return Ok(None);
@@ -272,7 +272,7 @@ impl Inner {
         let path = self.whole(digest);
         let mut file = match File::open(&path) {
             Ok(file) => file,
-            Err(error) if error.kind() == io::ErrorKind::NotFound && !matches!(self.hand, Hand::Alone) => {
+            Err(error) if error.kind() == io::ErrorKind::NotFound && !matches!(self.hand, FolderAccess::Alone) => {
                 return Ok(None);
             }
             // It was taken away in between.
@@ -283,7 +283,7 @@ impl Inner {
         Ok(Some(file))
     }
 
-    fn append(&self, file: Wanted, offset: u64, piece: &[u8]) -> Result<(), Error> {
+    fn append(&self, file: FileRef, offset: u64, piece: &[u8]) -> Result<(), Error> {
         if file.length == 0 || file.length > COMPONENT_BYTES_MAX {
             return Err(Error::Size);
         }
@@ -310,16 +310,16 @@ impl Inner {
         }
     }
 
-    fn list(&self) -> Vec<Stored> {
+    fn list(&self) -> Vec<StoredFile> {
         let shelf = self.shelf();
         let whole =
-            shelf.whole.iter().map(|(digest, w)| Stored { digest: *digest, bytes: w.length, touched: w.touched });
+            shelf.whole.iter().map(|(digest, w)| StoredFile { digest: *digest, bytes: w.length, touched: w.touched });
         let part = |(digest, entry): (&Digest, &Entry)| {
             // One that is being written now was touched just now.
             let (bytes, touched) = entry.part.try_lock().map_or((0, shelf.turn), |p| (p.written, entry.touched));
-            Stored { digest: *digest, bytes, touched }
+            StoredFile { digest: *digest, bytes, touched }
         };
-        let mut all: Vec<Stored> = whole.chain(shelf.parts.iter().map(part)).collect();
+        let mut all: Vec<StoredFile> = whole.chain(shelf.parts.iter().map(part)).collect();
         all.sort_by_key(|stored| stored.digest);
         all
     }
@@ -342,7 +342,7 @@ impl Inner {
     }
 
     /// The entry of a file, made if there is none. When there are too many, the one left alone longest goes.
-    fn entry(&self, shelf: &mut Shelf, file: Wanted) -> Result<Arc<Mutex<Part>>, Error> {
+    fn entry(&self, shelf: &mut Shelf, file: FileRef) -> Result<Arc<Mutex<PartialFile>>, Error> {
         shelf.turn += 1;
         let turn = shelf.turn;
         if let Some(entry) = shelf.parts.get_mut(&file.digest) {
@@ -361,17 +361,17 @@ impl Inner {
             }
         }
         let mark = Mark { length: file.length, durable: 0, writer: None };
-        let part = Arc::new(Mutex::new(Part { mark, written: 0, open: None }));
-        let entry = Entry { part: part.clone(), touched: turn, changed: Changed::default() };
+        let part = Arc::new(Mutex::new(PartialFile { mark, written: 0, open: None }));
+        let entry = Entry { part: part.clone(), touched: turn, changed: FileTime::default() };
         shelf.parts.insert(file.digest, entry);
         Ok(part)
     }
 
-    fn is_current(&self, digest: Digest, entry: &Arc<Mutex<Part>>) -> bool {
+    fn is_current(&self, digest: Digest, entry: &Arc<Mutex<PartialFile>>) -> bool {
         self.shelf().parts.get(&digest).is_some_and(|current| Arc::ptr_eq(&current.part, entry))
     }
 
-    fn add(&self, part: &mut Part, file: Wanted, offset: u64, piece: &[u8]) -> Result<(), Error> {
+    fn add(&self, part: &mut PartialFile, file: FileRef, offset: u64, piece: &[u8]) -> Result<(), Error> {
         if part.mark.length != file.length {
             self.reset(part, file)?;
         }
@@ -424,7 +424,7 @@ impl Inner {
     }
 
     /// Only what is durable counts from now on.
-    fn fall_back(&self, part: &mut Part) {
+    fn fall_back(&self, part: &mut PartialFile) {
         part.open = None;
         let lost = part.written - part.mark.durable;
         part.written = part.mark.durable;
@@ -432,7 +432,7 @@ impl Inner {
         shelf.used = shelf.used.saturating_sub(lost);
     }
 
-    fn reset(&self, part: &mut Part, file: Wanted) -> Result<(), Error> {
+    fn reset(&self, part: &mut PartialFile, file: FileRef) -> Result<(), Error> {
         part.mark.durable = 0;
         self.fall_back(part);
         part.mark = Mark { length: file.length, durable: 0, writer: None };
@@ -440,7 +440,7 @@ impl Inner {
     }
 
     /// Opens a part at its end and reads what is before it, once after a start and after another process wrote to it.
-    fn reopen(&self, part: &mut Part, digest: Digest) -> Result<(), Error> {
+    fn reopen(&self, part: &mut PartialFile, digest: Digest) -> Result<(), Error> {
         if part.open.is_some() {
             return Ok(());
         }
@@ -464,7 +464,7 @@ impl Inner {
     }
 
     /// The bytes first, then the word that they are there.
-    fn sync(&self, part: &mut Part, digest: Digest) -> Result<(), Error> {
+    fn sync(&self, part: &mut PartialFile, digest: Digest) -> Result<(), Error> {
         let path = self.part(digest);
         let synced = match &part.open {
             Some((file, _)) => file.sync_data(),
@@ -482,13 +482,13 @@ impl Inner {
         Ok(())
     }
 
-    fn settle(&self, file: Wanted) -> Result<Held, Error> {
+    fn settle(&self, file: FileRef) -> Result<Completeness, Error> {
         loop {
             let entry = {
                 let mut shelf = self.shelf();
                 if let Some(length) = shelf.touch(file.digest) {
                     self.touch_there(file.digest)?;
-                    return if length == file.length { Ok(Held::Whole) } else { Err(Error::Size) };
+                    return if length == file.length { Ok(Completeness::Whole) } else { Err(Error::Size) };
                 }
                 shelf.turn += 1;
                 let turn = shelf.turn;
@@ -497,26 +497,26 @@ impl Inner {
                     entry.part.clone()
                 })
             };
-            let Some(entry) = entry else { return Ok(Held::Part(0)) };
+            let Some(entry) = entry else { return Ok(Completeness::Part(0)) };
             let mut part = entry.lock().unwrap_or_else(PoisonError::into_inner);
             if !self.is_current(file.digest, &entry) {
                 continue;
             }
             if part.mark.length != file.length {
-                return Ok(Held::Part(0));
+                return Ok(Completeness::Part(0));
             }
             if part.written > part.mark.durable {
                 self.sync(&mut part, file.digest)?;
             }
             if part.written < file.length {
-                return Ok(Held::Part(part.written));
+                return Ok(Completeness::Part(part.written));
             }
             return self.finish(&mut part, file.digest);
         }
     }
 
     /// All bytes are here and durable: gives the file its name if they are the right ones.
-    fn finish(&self, part: &mut Part, digest: Digest) -> Result<Held, Error> {
+    fn finish(&self, part: &mut PartialFile, digest: Digest) -> Result<Completeness, Error> {
         self.reopen(part, digest)?;
         let found = part.open.as_ref().map_or_else(|| Hashing::default().digest(), |(_, hash)| hash.digest());
         if found != digest {
@@ -532,11 +532,11 @@ impl Inner {
         shelf.turn += 1;
         let touched = shelf.turn;
         shelf.parts.remove(&digest);
-        let changed = Changed::default();
+        let changed = FileTime::default();
         shelf.whole.insert(digest, Whole { length: part.written, touched, changed });
         drop(shelf);
         remove(&self.mark(digest))?;
-        Ok(Held::Whole)
+        Ok(Completeness::Whole)
     }
 
     /// Takes away what is here of a file that is not whole: first the word, then the bytes.

@@ -3,7 +3,7 @@
 //! Invariant: nothing is written or signed here, and only what the newest signed release lists is handed out. Shorter ways to files are listed like
 //! the files: they are made by whoever signs. Bytes are for machines that are enrolled: a genuine certificate alone is none of a robot.
 
-use crate::content::{Content, Wanted};
+use crate::content::{Content, FileRef};
 use crate::integrity::Integrity;
 use crate::refusal::{answer, status};
 use crate::repository::Documents;
@@ -105,7 +105,7 @@ impl Downloads {
     }
 
     /// Which file is meant and how long it is, if a signed release lists it and it is here whole.
-    pub(crate) async fn listed(&self, digest: Digest) -> Result<Wanted, Refusal> {
+    pub(crate) async fn listed(&self, digest: Digest) -> Result<FileRef, Refusal> {
         let shown = self.shown()?;
         let not_found = || Refusal::new(Kind::NotFound, Code::SoftwareNotFound);
         if !shown.lists(digest) {
@@ -119,7 +119,7 @@ impl Downloads {
         if !shown.integrity.holds(shown.content.as_ref(), digest).await? {
             return Err(not_found());
         }
-        Ok(Wanted { digest, length })
+        Ok(FileRef { digest, length })
     }
 
     async fn encoding(&self, r: v1::GetEncodingRequest, by: &Caller) -> Result<v1::GetEncodingResponse, Refusal> {

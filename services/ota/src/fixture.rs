@@ -1,6 +1,6 @@
 //! Release people in a test: their keys, bundles, documents, and a robot that looks at what the server shows.
 
-use crate::content::{Content, DiskContent, Held, Room as Space, Wanted};
+use crate::content::{Completeness, Content, DiskContent, FileRef, Room as Space};
 use crate::folder::Owner;
 use crate::repository::{Act, OnlineKeys, Repository};
 use crate::{OtaService, Parts};
@@ -172,10 +172,10 @@ impl Room {
     /// Brings files whole.
     pub async fn bring(&self, files: &[(String, Vec<u8>)]) {
         for (_, content) in files {
-            let file = Wanted { digest: Digest::of_content(content), length: content.len() as u64 };
-            if self.content.settle(file).await.expect("asked") != Held::Whole {
+            let file = FileRef { digest: Digest::of_content(content), length: content.len() as u64 };
+            if self.content.settle(file).await.expect("asked") != Completeness::Whole {
                 self.content.append(file, 0, Bytes::copy_from_slice(content)).await.expect("room");
-                assert_eq!(self.content.settle(file).await.expect("whole"), Held::Whole);
+                assert_eq!(self.content.settle(file).await.expect("whole"), Completeness::Whole);
             }
         }
     }
@@ -222,7 +222,7 @@ pub async fn service(dir: &TempDir) -> OtaService {
 pub async fn release(service: &OtaService, files: &[(String, Vec<u8>)]) {
     let opened = service.opened().expect("keys");
     for (_, content) in files {
-        let file = Wanted { digest: Digest::of_content(content), length: content.len() as u64 };
+        let file = FileRef { digest: Digest::of_content(content), length: content.len() as u64 };
         opened.content.append(file, 0, Bytes::copy_from_slice(content)).await.expect("room");
         opened.content.settle(file).await.expect("whole");
     }

@@ -1,6 +1,6 @@
 //! The gRPC face of releases: decode, call, encode. That of bytes is in `downloads`.
 
-use crate::content::{Held, Wanted};
+use crate::content::{Completeness, FileRef};
 use crate::pages;
 use crate::refusal::{self, answer, status};
 use crate::repository::Act;
@@ -18,7 +18,7 @@ use midshift_proto::ota::v1::bundle_service_server::BundleService as BundleFace;
 use tonic::{Request, Response, Status, Streaming};
 
 /// Which file a request means, and everything that is wrong with that.
-fn wanted(digest: &str, length: u64) -> Result<Wanted, Refusal> {
+fn wanted(digest: &str, length: u64) -> Result<FileRef, Refusal> {
     let mut bad = Violations::default();
     let digest = bad.accept("digest", digest.parse::<Digest>());
     if length == 0 {
@@ -29,7 +29,7 @@ fn wanted(digest: &str, length: u64) -> Result<Wanted, Refusal> {
         return Err(refusal::too_large(length));
     }
     let digest = digest.ok_or_else(|| Refusal::field("digest", "is required"))?;
-    Ok(Wanted { digest, length })
+    Ok(FileRef { digest, length })
 }
 
 impl OtaService {
@@ -37,11 +37,11 @@ impl OtaService {
         let opened = self.opened()?;
         let file = wanted(&r.digest, r.length)?;
         let held = opened.content.settle(file).await?;
-        Ok(v1::GetUploadResponse { durable_bytes: durable(held, file), is_complete: held == Held::Whole })
+        Ok(v1::GetUploadResponse { durable_bytes: durable(held, file), is_complete: held == Completeness::Whole })
     }
 
     /// Takes one piece; the file is what the first one named.
-    async fn piece(&self, file: Wanted, message: v1::UploadTargetRequest) -> Result<(), Refusal> {
+    async fn piece(&self, file: FileRef, message: v1::UploadTargetRequest) -> Result<(), Refusal> {
         if message.data.len() > limits::UPLOAD_PIECE_BYTES {
             let most = limits::UPLOAD_PIECE_BYTES;
             return Err(Refusal::field("data", format!("has {} bytes, at most {most}", message.data.len())));
@@ -53,9 +53,9 @@ impl OtaService {
         Ok(opened.content.append(file, message.offset, data).await?)
     }
 
-    async fn uploaded(&self, file: Wanted) -> Result<v1::UploadTargetResponse, Refusal> {
+    async fn uploaded(&self, file: FileRef) -> Result<v1::UploadTargetResponse, Refusal> {
         let held = self.opened()?.content.settle(file).await?;
-        Ok(v1::UploadTargetResponse { durable_bytes: durable(held, file), is_complete: held == Held::Whole })
+        Ok(v1::UploadTargetResponse { durable_bytes: durable(held, file), is_complete: held == Completeness::Whole })
     }
 
     async fn publish(
@@ -84,10 +84,10 @@ impl OtaService {
     }
 }
 
-fn durable(held: Held, file: Wanted) -> u64 {
+fn durable(held: Completeness, file: FileRef) -> u64 {
     match held {
-        Held::Whole => file.length,
-        Held::Part(bytes) => bytes,
+        Completeness::Whole => file.length,
+        Completeness::Part(bytes) => bytes,
     }
 }
 

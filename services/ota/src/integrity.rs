@@ -21,12 +21,12 @@ const FILES_MAX: usize = 4_096;
 
 /// When a file was hashed, and what came of it.
 #[derive(Clone, Copy)]
-struct Hashed {
+struct HashResult {
     at: Instant,
     is_whole: bool,
 }
 
-impl Hashed {
+impl HashResult {
     fn now(is_whole: bool) -> Self {
         Self { at: Instant::now(), is_whole }
     }
@@ -52,7 +52,7 @@ async fn is_whole(content: &dyn Content, digest: Digest) -> Result<Option<bool>,
 }
 
 /// One file. Who asks for it meanwhile waits until it is hashed.
-type Check = Arc<tokio::sync::Mutex<Option<Hashed>>>;
+type Check = Arc<tokio::sync::Mutex<Option<HashResult>>>;
 
 /// What is known of the files of a folder.
 #[derive(Default)]
@@ -81,18 +81,18 @@ impl Integrity {
     pub async fn holds(&self, content: &dyn Content, digest: Digest) -> Result<bool, Error> {
         let check = self.check(digest);
         let mut last = check.lock().await;
-        if let Some(hashed) = last.filter(Hashed::counts) {
+        if let Some(hashed) = last.filter(HashResult::counts) {
             return Ok(hashed.is_whole);
         }
         let Some(is_whole) = is_whole(content, digest).await? else { return Ok(false) };
         if is_whole {
-            *last = Some(Hashed::now(true));
+            *last = Some(HashResult::now(true));
             return Ok(true);
         }
         tracing::error!(%digest, "a signed file is damaged on the disk: push its release again");
         self.damaged().insert(digest);
         // Where others keep the folder it stays, and they find it too.
-        *last = content.remove(digest).await.is_err().then(|| Hashed::now(false));
+        *last = content.remove(digest).await.is_err().then(|| HashResult::now(false));
         Ok(false)
     }
 

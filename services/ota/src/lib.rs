@@ -21,7 +21,7 @@ mod integrity;
 #[expect(dead_code, reason = "shared with tests that need tasks too")]
 #[path = "../../../tests/src/old_site.rs"]
 mod old_site;
-mod opened;
+mod open_folder;
 mod pages;
 mod reader;
 mod refusal;

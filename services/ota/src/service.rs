@@ -5,7 +5,7 @@ use crate::content::{Content, DiskContent, Room, Sharing};
 use crate::downloads::{Downloads, add_bundles, add_chunks};
 use crate::folder::{self, FolderLock, Gate, Owner};
 use crate::http1;
-use crate::opened::Opened;
+use crate::open_folder::OpenFolder;
 use crate::repository::{Error, OnlineKeys, Repository};
 use crate::threads::blocking;
 use midshift_core::Boxed;
@@ -40,7 +40,7 @@ pub struct Parts {
 #[derive(Clone)]
 pub struct OtaService {
     /// None: the server was given no keys, and every call says so.
-    opened: Option<Arc<Opened>>,
+    opened: Option<Arc<OpenFolder>>,
     /// Rows that say who is enrolled. None: nobody is held against them.
     rows: Option<Arc<dyn Store>>,
 }
@@ -88,7 +88,7 @@ impl OtaService {
         let repository = repository.with_clock(clock.clone());
         let downloads = Downloads::new(content.clone(), repository.documents().clone());
         let (named, leads) = (watch::Sender::new(None), watch::Sender::new(true));
-        let opened = Opened { content, repository, collector, named, leads, clock, downloads, lock };
+        let opened = OpenFolder { content, repository, collector, named, leads, clock, downloads, lock };
         Ok(Self { opened: Some(Arc::new(opened)), rows: None })
     }
     /// A service of a server without keys: it touches no disk and answers every call with what to do.
@@ -151,7 +151,7 @@ impl OtaService {
             opened.leads.send_if_modified(|known| std::mem::replace(known, leads) != leads);
         }
     }
-    pub(crate) fn opened(&self) -> Result<&Opened, Refusal> {
+    pub(crate) fn opened(&self) -> Result<&OpenFolder, Refusal> {
         self.opened.as_deref().ok_or_else(|| Refusal::new(Kind::Precondition, Code::NoOnlineKeys))
     }
 }
@@ -159,7 +159,7 @@ impl OtaService {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::content::Wanted;
+    use crate::content::FileRef;
     use crate::fixture::{START, files, release, service, write_keys};
     use crate::repository::FRESHEN_AFTER_MS;
     use crate::rollouts;
@@ -213,8 +213,8 @@ mod tests {
         release(&service, &walk).await;
         let opened = service.opened().expect("keys");
         let stray = midshift_bundle::digest::Digest::of_content(b"stray");
-        opened.content.append(Wanted { digest: stray, length: 5 }, 0, "stray".into()).await.expect("room");
-        opened.content.settle(Wanted { digest: stray, length: 5 }).await.expect("whole");
+        opened.content.append(FileRef { digest: stray, length: 5 }, 0, "stray".into()).await.expect("room");
+        opened.content.settle(FileRef { digest: stray, length: 5 }).await.expect("whole");
         let site = Arc::new(midshift_core::site::text::parse(midshift_core::site::DEMO).expect("the demo reads"));
         let store_id = midshift_store::StoreId(Arc::from("store"));
         let store = midshift_store::MemoryStore::new(site.site_id().clone(), store_id, clock.clone());
@@ -252,7 +252,7 @@ mod tests {
         let service = service(&dir).await;
         let stray = b"brought and never signed";
         let opened = service.opened().expect("keys");
-        let file = Wanted { digest: midshift_bundle::digest::Digest::of_content(stray), length: stray.len() as u64 };
+        let file = FileRef { digest: midshift_bundle::digest::Digest::of_content(stray), length: stray.len() as u64 };
         opened.content.append(file, 0, bytes::Bytes::from_static(stray)).await.expect("room");
         opened.content.settle(file).await.expect("whole");
         let refusal = opened.downloads.listed(file.digest).await.expect_err("nobody signed it");

@@ -3,7 +3,7 @@
 use crate::content::Room;
 use crate::fixture::{SEEDS, START, files, release, robot, targets, write_keys};
 use crate::folder::Owner;
-use crate::opened::Opened;
+use crate::open_folder::OpenFolder;
 use crate::repository::{Act, CannotSign, Error, FRESHEN_AFTER_MS};
 use crate::{OtaService, Parts};
 use midshift_bundle::trust::{self, Reading, Source, Trusted};
@@ -38,7 +38,7 @@ impl Site {
         let service = OtaService::open(parts).await.expect("a service");
         Self { us, ahead_ms, service, _dir: dir }
     }
-    fn opened(&self) -> &Opened {
+    fn opened(&self) -> &OpenFolder {
         self.service.opened().expect("keys")
     }
     /// Time passes, and the server looks.
@@ -72,7 +72,7 @@ impl Site {
         let (opened, more) = (self.opened(), files("walk", version));
         for (_, content) in &more {
             let digest = midshift_bundle::digest::Digest::of_content(content);
-            let file = crate::content::Wanted { digest, length: content.len() as u64 };
+            let file = crate::content::FileRef { digest, length: content.len() as u64 };
             if opened.content.length(digest).await?.is_none() {
                 opened.content.append(file, 0, bytes::Bytes::copy_from_slice(content)).await?;
                 opened.content.settle(file).await?;

@@ -5,7 +5,7 @@ use crate::robots::enrolment;
 use crate::room::LIMIT;
 use crate::secrets::heard;
 use midshift_agent::sets::disk::DiskSets;
-use midshift_agent::sets::{Sets, Wanted};
+use midshift_agent::sets::{FileRef, Sets};
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::store::{Op, Store};
 use midshift_agent::switch::{FACTORY, Fallen, Switch};
@@ -83,7 +83,7 @@ impl Machine {
     /// A set with these settings in the robot's folder.
     fn stage(&self, version: &str, behaviour: &str) -> anyhow::Result<SetManifest> {
         let mut sets = DiskSets::open(&self.path("sets"))?;
-        let wanted = Wanted { digest: Digest::of_content(behaviour.as_bytes()), length: behaviour.len() as u64 };
+        let wanted = FileRef { digest: Digest::of_content(behaviour.as_bytes()), length: behaviour.len() as u64 };
         sets.write(&wanted, 0, behaviour.as_bytes())?;
         sets.sync(&wanted)?;
         sets.seal(&wanted)?;

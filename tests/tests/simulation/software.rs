@@ -12,7 +12,7 @@ use midshift_cli::samples::{NAME, SAMPLES};
 use midshift_core::ids::{BundleId, SiteId};
 use midshift_core::limits;
 use midshift_core::time::{Clock, Utc};
-use midshift_ota::content::{Content, DiskContent, Room, Wanted};
+use midshift_ota::content::{Content, DiskContent, FileRef, Room};
 use midshift_ota::folder::Owner;
 use midshift_ota::repository::{Act, OnlineKeys, Repository};
 use midshift_ota::{OtaService, Parts};
@@ -117,7 +117,7 @@ impl Software {
         let content =
             DiskContent::open(&self.folder().join("content"), Room::with_quota(limits::SOFTWARE_BYTES_DEFAULT))?;
         for (_, bytes) in files {
-            let file = Wanted { digest: Digest::of_content(&bytes), length: bytes.len() as u64 };
+            let file = FileRef { digest: Digest::of_content(&bytes), length: bytes.len() as u64 };
             content.append(file, 0, bytes.into()).await?;
             content.settle(file).await?;
         }

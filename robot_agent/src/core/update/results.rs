@@ -4,7 +4,7 @@
 
 use crate::core::state::AgentCore;
 use crate::launcher::switch::Switch;
-use crate::sets::{Holdings, Wanted};
+use crate::sets::{FileRef, Holdings};
 use crate::storage::Update;
 use crate::update::{Done, Failure, Job, io, migration, retry};
 use midshift_bundle::manifest::{Manifest, Migration};
@@ -100,7 +100,7 @@ impl AgentCore {
     }
 
     /// What comes of the bundle on this robot, or why it does not fit.
-    fn plan(&mut self, now: &Now, wanted: &Wanted, manifest: &Manifest, bytes: &[u8]) {
+    fn plan(&mut self, now: &Now, wanted: &FileRef, manifest: &Manifest, bytes: &[u8]) {
         let Some(update) = self.memory.ledger.software.update.clone() else { return };
         let Some(holdings) = self.update.holdings.clone() else { return };
         let current = holdings.set(&holdings.switch.current).unwrap_or_default();

@@ -6,7 +6,7 @@ use super::conditions::Case;
 use super::machine::{Condition, Step};
 use crate::core::interface::ExitReason;
 use crate::core::state::AgentCore;
-use crate::sets::Wanted;
+use crate::sets::FileRef;
 use crate::storage::{SoftwareRow, Update};
 use crate::update::{Job, migration};
 use midshift_bundle::set::{SetManifest, raised};
@@ -30,7 +30,7 @@ impl AgentCore {
             Step::RefreshAgain => self.refresh_again(now),
             Step::FetchManifest => {
                 self.ask_for(Job::Manifest {
-                    wanted: Wanted { digest: update.bundle, length: update.manifest_length },
+                    wanted: FileRef { digest: update.bundle, length: update.manifest_length },
                 });
             }
             Step::FetchContent | Step::StageSet => update.set.iter().for_each(|set| self.gather(set)),
@@ -92,7 +92,7 @@ impl AgentCore {
             Some(c) => {
                 let rate_bytes_s = self.update.desired.as_ref().map_or(0, |d| d.rate_bytes_s);
                 let bases = self.update.holdings.as_ref().map(|holdings| holdings.bases(c)).unwrap_or_default();
-                Job::Fetch { wanted: Wanted { digest: c.digest, length: c.length }, bases, rate_bytes_s }
+                Job::Fetch { wanted: FileRef { digest: c.digest, length: c.length }, bases, rate_bytes_s }
             }
             None => Job::Stage(Box::new(set.clone())),
         };

@@ -1,7 +1,7 @@
 //! What goes, what stays, and that a cut anywhere costs nothing that is needed.
 
-use super::{Collected, Collector, Named, UNNAMED};
-use crate::content::{Content, DiskContent, Error, Held, Room, Wanted};
+use super::{CollectionOutcome, Collector, NamedBundles, UNNAMED};
+use crate::content::{Completeness, Content, DiskContent, Error, FileRef, Room};
 use crate::fixture::{SEEDS, START, bundle, first_root, key, target, write_keys};
 use crate::repository::{Act, OnlineKeys, Repository};
 use bytes::Bytes;
@@ -30,16 +30,16 @@ struct Shop {
     content: Arc<DiskContent>,
     repository: Repository,
     collector: Collector,
-    named: Named,
+    named: NamedBundles,
 }
 
 impl Shop {
     async fn new(quota_bytes: u64) -> Self {
         let dir = TempDir::new().expect("a folder");
         write_keys(&dir.path().join("keys"));
-        Self::open(dir, Room { quota_bytes, spare_bytes: 0, unnamed_ms: TIME }, Named::default()).await
+        Self::open(dir, Room { quota_bytes, spare_bytes: 0, unnamed_ms: TIME }, NamedBundles::default()).await
     }
-    async fn open(dir: TempDir, room: Room, named: Named) -> Self {
+    async fn open(dir: TempDir, room: Room, named: NamedBundles) -> Self {
         let keys = OnlineKeys::read(&dir.path().join("keys")).expect("keys");
         let content = Arc::new(DiskContent::open(&dir.path().join("content"), room).expect("a store"));
         let repository = Repository::open(&dir.path().join("metadata"), keys, content.clone()).await;
@@ -51,9 +51,9 @@ impl Shop {
         let Self { dir, room, named, .. } = self;
         Self::open(dir, room, named).await
     }
-    async fn bring(&self, content: &[u8]) -> Result<Held, Error> {
+    async fn bring(&self, content: &[u8]) -> Result<Completeness, Error> {
         let file = wanted(content);
-        if self.content.settle(file).await? != Held::Whole {
+        if self.content.settle(file).await? != Completeness::Whole {
             self.content.append(file, 0, Bytes::copy_from_slice(content)).await?;
         }
         self.content.settle(file).await
@@ -87,19 +87,19 @@ impl Shop {
     fn name(&mut self, bundles: &[&Bundle]) {
         self.named.bundles = bundles.iter().map(|(manifest, _)| id(manifest)).collect();
     }
-    async fn pass(&self) -> Result<Collected, crate::repository::Error> {
+    async fn pass(&self) -> Result<CollectionOutcome, crate::repository::Error> {
         let content = self.content.as_ref();
         self.collector.collect(content, &self.repository, &self.named, START).await
     }
     /// A pass after so many milliseconds of serving.
-    async fn after(&mut self, ms: u64) -> Collected {
+    async fn after(&mut self, ms: u64) -> CollectionOutcome {
         self.named.served_ms += ms;
         self.pass().await.expect("a pass")
     }
 }
 
-fn wanted(content: &[u8]) -> Wanted {
-    Wanted { digest: Digest::of_content(content), length: content.len() as u64 }
+fn wanted(content: &[u8]) -> FileRef {
+    FileRef { digest: Digest::of_content(content), length: content.len() as u64 }
 }
 
 fn id(manifest: &Manifest) -> BundleId {
@@ -144,7 +144,7 @@ async fn what_nobody_published_goes_when_its_time_is_over_and_no_moment_earlier(
     let done = shop.after(1).await;
     assert_eq!((done.files, done.file_bytes, done.unnamed_bytes), (2, stray.len() as u64 + 7, 0));
     assert!(!shop.has(stray).await);
-    assert_eq!(shop.content.settle(half).await.expect("asked"), Held::Part(0));
+    assert_eq!(shop.content.settle(half).await.expect("asked"), Completeness::Part(0));
     for (name, content) in &walk.1 {
         assert!(shop.has(content).await, "{name} is listed");
     }
@@ -160,7 +160,7 @@ async fn a_withdrawn_bundle_stays_while_it_is_named_and_shared_files_stay_for_th
     shop.name(&[&old]);
     shop.publish(&[&new]).await.expect("withdrawn");
     for _ in 0..3 {
-        assert_eq!(shop.after(TIME).await, Collected::default(), "a robot may need it");
+        assert_eq!(shop.after(TIME).await, CollectionOutcome::default(), "a robot may need it");
     }
     shop.name(&[]);
     shop.after(1).await;
@@ -181,7 +181,7 @@ async fn published_again_within_its_time_it_need_not_be_brought_again() {
     shop.after(1).await;
     shop.after(TIME - 1).await;
     shop.publish(&[&old, &new]).await.expect("all of it is here");
-    assert_eq!(shop.after(TIME).await, Collected::default());
+    assert_eq!(shop.after(TIME).await, CollectionOutcome::default());
     shop.publish(&[&new]).await.expect("withdrawn again");
     assert_eq!(shop.after(1).await.files, 0, "its time begins anew");
 }
@@ -200,15 +200,15 @@ async fn an_upload_that_goes_on_is_not_cut_and_one_that_was_left_alone_begins_an
     // Killed: what was durable counts, and its time goes on where it was.
     let mut shop = shop.restarted().await;
     assert_eq!(shop.after(TIME - 1).await.files, 0);
-    assert_eq!(shop.content.settle(file).await.expect("asked"), Held::Part(3_000));
+    assert_eq!(shop.content.settle(file).await.expect("asked"), Completeness::Part(3_000));
     assert_eq!(shop.after(TIME - 1).await.files, 0, "somebody asked for it");
     shop.content.append(file, 3_000, piece(3_000)).await.expect("the rest");
-    assert_eq!(shop.content.settle(file).await.expect("whole"), Held::Whole);
+    assert_eq!(shop.content.settle(file).await.expect("whole"), Completeness::Whole);
     assert_eq!(shop.after(TIME).await.files, 0, "it is new");
-    assert_eq!(shop.content.settle(file).await.expect("whole"), Held::Whole);
+    assert_eq!(shop.content.settle(file).await.expect("whole"), Completeness::Whole);
     assert_eq!(shop.after(TIME).await.files, 0, "who goes on with the release asks for it again");
     assert_eq!(shop.after(TIME).await.files, 1);
-    assert_eq!(shop.bring(&content).await.expect("brought anew"), Held::Whole);
+    assert_eq!(shop.bring(&content).await.expect("brought anew"), Completeness::Whole);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -3,7 +3,10 @@
 //! Invariant: nothing that was remembered from an earlier turn counts unless the disk says the same. Of a file that is not whole the
 //! mark says who wrote to it last; who finds another there begins from what lies on the disk.
 
-use super::{Changed, DiskContent, Entry, Hand, Inner, Mark, Part, Room, Sharing, Shelf, Whole, read_mark, remove};
+use super::{
+    DiskContent, Entry, FileTime, FolderAccess, Inner, Mark, PartialFile, Room, Sharing, Shelf, Whole, read_mark,
+    remove,
+};
 use crate::disk::{Error, at, sync_folder, write_whole};
 use midshift_bundle::digest::Digest;
 use rustix::fs::{AtFlags, CWD, Timespec, Timestamps, UTIME_NOW, utimensat};
@@ -17,7 +20,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 /// A file of a folder.
 struct There {
     length: u64,
-    changed: Changed,
+    changed: FileTime,
 }
 
 /// Files of a folder by name; none if it is not there. One that goes meanwhile is left out.
@@ -49,18 +52,22 @@ impl DiskContent {
     pub fn join(path: &Path, room: Room, sharing: Sharing) -> Result<Self, Error> {
         fs::create_dir_all(path).map_err(at("making", path))?;
         if sharing.is_first {
-            let mended = Self::mended(path, room, Hand::Shared(sharing))?;
+            let mended = Self::mended(path, room, FolderAccess::Shared(sharing))?;
             mended.inner.cut()?;
             return Ok(mended);
         }
-        let inner = Inner { path: path.to_owned(), room, hand: Hand::Shared(sharing), shelf: Mutex::default() };
+        let inner = Inner { path: path.to_owned(), room, hand: FolderAccess::Shared(sharing), shelf: Mutex::default() };
         Ok(Self { inner: Arc::new(inner) })
     }
 
     /// A folder that other processes keep, to be read only. It need not be there yet.
     pub fn reading(path: &Path) -> Self {
-        let inner =
-            Inner { path: path.to_owned(), room: Room::with_quota(0), hand: Hand::Reading, shelf: Mutex::default() };
+        let inner = Inner {
+            path: path.to_owned(),
+            room: Room::with_quota(0),
+            hand: FolderAccess::Reading,
+            shelf: Mutex::default(),
+        };
         Self { inner: Arc::new(inner) }
     }
 }
@@ -89,7 +96,7 @@ impl Inner {
 
     /// Tells other processes that somebody brings this file.
     pub(super) fn touch_there(&self, digest: Digest) -> Result<(), Error> {
-        if !matches!(self.hand, Hand::Shared(_)) {
+        if !matches!(self.hand, FolderAccess::Shared(_)) {
             return Ok(());
         }
         let now = || Timespec { tv_sec: 0, tv_nsec: UTIME_NOW };
@@ -99,8 +106,8 @@ impl Inner {
     }
 
     /// Says in the mark that this process writes to a part from now on.
-    pub(super) fn make_ours(&self, part: &mut Part, digest: Digest) -> Result<(), Error> {
-        let Hand::Shared(sharing) = &self.hand else { return Ok(()) };
+    pub(super) fn make_ours(&self, part: &mut PartialFile, digest: Digest) -> Result<(), Error> {
+        let FolderAccess::Shared(sharing) = &self.hand else { return Ok(()) };
         if part.mark.writer != Some(sharing.number) {
             let mark = Mark { writer: Some(sharing.number), ..part.mark };
             self.write_mark(digest, &mark)?;
@@ -116,7 +123,7 @@ impl Inner {
 
     /// Makes what is remembered be what is there. It is our turn.
     pub(super) fn refresh_shelf(&self) -> Result<(), Error> {
-        let Hand::Shared(sharing) = &self.hand else { return Ok(()) };
+        let FolderAccess::Shared(sharing) = &self.hand else { return Ok(()) };
         let found = there(&self.path)?;
         let mut shelf = self.shelf();
         let wholes = found.iter().filter_map(|(name, file)| Some((name.parse::<Digest>().ok()?, file)));
@@ -151,7 +158,7 @@ impl Inner {
                 Some(known) if mark.writer == Some(number) => known.part,
                 _ => {
                     let written = file.length.min(mark.length);
-                    Arc::new(Mutex::new(Part { mark, written, open: None }))
+                    Arc::new(Mutex::new(PartialFile { mark, written, open: None }))
                 }
             };
             parts.insert(digest, Entry { part, touched, changed: file.changed });

@@ -1,6 +1,6 @@
 //! Files in pieces, over restarts, under a quota.
 
-use super::{Content, DiskContent, Error, Held, Room, Wanted};
+use super::{Completeness, Content, DiskContent, Error, FileRef, Room};
 use bytes::Bytes;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::COMPONENT_BYTES_MAX;
@@ -16,15 +16,15 @@ fn store(dir: &TempDir) -> DiskContent {
     DiskContent::open(dir.path(), Room::with_quota(QUOTA)).expect("a store")
 }
 
-fn wanted(content: &[u8]) -> Wanted {
-    Wanted { digest: Digest::of_content(content), length: content.len() as u64 }
+fn wanted(content: &[u8]) -> FileRef {
+    FileRef { digest: Digest::of_content(content), length: content.len() as u64 }
 }
 
 fn bytes(count: usize, seed: u8) -> Vec<u8> {
     (0..count).map(|i| (i % 251) as u8 ^ seed).collect()
 }
 
-async fn bring(store: &DiskContent, content: &[u8]) -> Result<Held, Error> {
+async fn bring(store: &DiskContent, content: &[u8]) -> Result<Completeness, Error> {
     let file = wanted(content);
     store.append(file, 0, Bytes::copy_from_slice(content)).await?;
     store.settle(file).await
@@ -50,22 +50,22 @@ async fn a_file_is_brought_on_after_a_restart_from_where_it_was_durable() {
     let content = bytes(1000, 1);
     let file = wanted(&content);
     let first = store(&dir);
-    assert_eq!(first.settle(file).await.expect("asked"), Held::Part(0));
+    assert_eq!(first.settle(file).await.expect("asked"), Completeness::Part(0));
     first.append(file, 0, Bytes::copy_from_slice(&content[..400])).await.expect("a piece");
-    assert_eq!(first.settle(file).await.expect("durable"), Held::Part(400));
+    assert_eq!(first.settle(file).await.expect("durable"), Completeness::Part(400));
     assert_eq!(first.length(file.digest).await.expect("asked"), None, "half a file has no name");
     first.append(file, 400, Bytes::copy_from_slice(&content[400..700])).await.expect("never acknowledged");
     drop(first);
     let again = store(&dir);
-    assert_eq!(again.settle(file).await.expect("asked"), Held::Part(400));
+    assert_eq!(again.settle(file).await.expect("asked"), Completeness::Part(400));
     let early = again.append(file, 700, Bytes::copy_from_slice(&content[700..])).await;
     assert!(matches!(early, Err(Error::Moved { at: 400, offset: 700 })), "{early:?}");
     again.append(file, 400, Bytes::copy_from_slice(&content[400..])).await.expect("the rest");
-    assert_eq!(again.settle(file).await.expect("whole"), Held::Whole);
+    assert_eq!(again.settle(file).await.expect("whole"), Completeness::Whole);
     assert_eq!(names(dir.path()), [file.digest.to_string()]);
     drop(again);
     let third = store(&dir);
-    assert_eq!(third.settle(file).await.expect("asked"), Held::Whole);
+    assert_eq!(third.settle(file).await.expect("asked"), Completeness::Whole);
     assert_eq!(read(&third, file.digest, 0..1000).await, content);
 }
 
@@ -84,9 +84,9 @@ async fn what_lies_beyond_the_mark_is_not_believed_after_a_cut() {
     fs::write(&part, torn).expect("a torn tail");
     fs::write(dir.path().join(format!("{}.mark.new", file.digest)), "{\"leng").expect("a torn mark");
     let again = store(&dir);
-    assert_eq!(again.settle(file).await.expect("asked"), Held::Part(400));
+    assert_eq!(again.settle(file).await.expect("asked"), Completeness::Part(400));
     again.append(file, 400, Bytes::copy_from_slice(&content[400..])).await.expect("the rest");
-    assert_eq!(again.settle(file).await.expect("whole"), Held::Whole);
+    assert_eq!(again.settle(file).await.expect("whole"), Completeness::Whole);
     assert_eq!(names(dir.path()), [file.digest.to_string()]);
 }
 
@@ -101,8 +101,8 @@ async fn a_part_shorter_than_its_mark_begins_anew() {
     drop(first);
     fs::write(dir.path().join(format!("{}.part", file.digest)), &content[..10]).expect("lost bytes");
     let again = store(&dir);
-    assert_eq!(again.settle(file).await.expect("asked"), Held::Part(0));
-    assert_eq!(bring(&again, &content).await.expect("whole"), Held::Whole);
+    assert_eq!(again.settle(file).await.expect("asked"), Completeness::Part(0));
+    assert_eq!(bring(&again, &content).await.expect("whole"), Completeness::Whole);
 }
 
 #[tokio::test]
@@ -115,7 +115,7 @@ async fn wrong_bytes_are_thrown_away_and_the_right_ones_may_come() {
     let error = store.settle(file).await.expect_err("others");
     assert!(matches!(error, Error::WrongBytes { found } if found == Digest::of_content(&bytes(500, 5))), "{error}");
     assert_eq!(names(dir.path()), Vec::<String>::new());
-    assert_eq!(bring(&store, &content).await.expect("whole"), Held::Whole);
+    assert_eq!(bring(&store, &content).await.expect("whole"), Completeness::Whole);
 }
 
 #[tokio::test]
@@ -123,11 +123,11 @@ async fn another_length_begins_the_file_anew() {
     let dir = TempDir::new().expect("a folder");
     let store = store(&dir);
     let content = bytes(500, 6);
-    let lied = Wanted { length: 900, ..wanted(&content) };
+    let lied = FileRef { length: 900, ..wanted(&content) };
     store.append(lied, 0, Bytes::from(bytes(300, 7))).await.expect("a piece");
-    assert_eq!(store.settle(lied).await.expect("durable"), Held::Part(300));
-    assert_eq!(store.settle(wanted(&content)).await.expect("asked"), Held::Part(0));
-    assert_eq!(bring(&store, &content).await.expect("whole"), Held::Whole);
+    assert_eq!(store.settle(lied).await.expect("durable"), Completeness::Part(300));
+    assert_eq!(store.settle(wanted(&content)).await.expect("asked"), Completeness::Part(0));
+    assert_eq!(bring(&store, &content).await.expect("whole"), Completeness::Whole);
     assert!(matches!(store.settle(lied).await, Err(Error::Size)), "it is known how long it is");
 }
 
@@ -141,7 +141,7 @@ async fn two_who_bring_one_file_hear_where_it_is() {
     let error = store.append(file, 0, Bytes::copy_from_slice(&content[..60])).await.expect_err("the other");
     assert!(matches!(error, Error::Moved { at: 60, offset: 0 }), "{error}");
     store.append(file, 60, Bytes::copy_from_slice(&content[60..])).await.expect("the other goes on");
-    assert_eq!(store.settle(file).await.expect("whole"), Held::Whole);
+    assert_eq!(store.settle(file).await.expect("whole"), Completeness::Whole);
     let error = store.append(file, 0, Bytes::copy_from_slice(&content)).await.expect_err("it is here");
     assert!(matches!(error, Error::Moved { at: 100, .. }), "{error}");
 }
@@ -159,7 +159,7 @@ async fn the_quota_counts_whole_files_and_parts_over_restarts() {
     drop(first);
     let again = store(&dir);
     assert!(matches!(bring(&again, &other).await, Err(Error::Full { .. })));
-    let wrong = Wanted { digest: Digest::of_content(b"something else"), length: QUOTA / 2 };
+    let wrong = FileRef { digest: Digest::of_content(b"something else"), length: QUOTA / 2 };
     again.append(wrong, 0, Bytes::from(bytes(QUOTA as usize / 2, 11))).await.expect("it fits");
     assert!(matches!(bring(&again, b"x").await, Err(Error::Full { .. })), "parts count too");
     assert!(matches!(again.settle(wrong).await, Err(Error::WrongBytes { .. })));
@@ -172,12 +172,12 @@ async fn sizes_beyond_the_cap_and_bytes_beyond_the_whole_are_refused() {
     let store = DiskContent::open(dir.path(), Room::with_quota(u64::MAX)).expect("a store");
     let digest = Digest::of_content(b"any");
     for length in [0, COMPONENT_BYTES_MAX + 1, u64::MAX] {
-        let error = store.append(Wanted { digest, length }, 0, Bytes::from_static(b"x")).await.expect_err("refused");
+        let error = store.append(FileRef { digest, length }, 0, Bytes::from_static(b"x")).await.expect_err("refused");
         assert!(matches!(error, Error::Size), "{length}: {error}");
     }
-    let largest = Wanted { digest, length: COMPONENT_BYTES_MAX };
+    let largest = FileRef { digest, length: COMPONENT_BYTES_MAX };
     store.append(largest, 0, Bytes::from_static(b"x")).await.expect("the largest");
-    let short = Wanted { digest: Digest::of_content(b"abc"), length: 3 };
+    let short = FileRef { digest: Digest::of_content(b"abc"), length: 3 };
     let error = store.append(short, 0, Bytes::from_static(b"abcd")).await.expect_err("one too many");
     assert!(matches!(error, Error::TooLong { length: 3, end: 4 }), "{error}");
 }
@@ -226,9 +226,9 @@ async fn of_too_many_unfinished_files_the_one_left_alone_longest_goes() {
     store.append(wanted(&files[0]), 4, Bytes::copy_from_slice(&files[0][4..5])).await.expect("a piece");
     let last = &files[limits::UPLOADS_MAX];
     store.append(wanted(last), 0, Bytes::copy_from_slice(&last[..4])).await.expect("a piece");
-    assert_eq!(store.settle(wanted(&files[0])).await.expect("asked"), Held::Part(5));
-    assert_eq!(store.settle(wanted(&files[1])).await.expect("asked"), Held::Part(0));
-    assert_eq!(store.settle(wanted(last)).await.expect("asked"), Held::Part(4));
+    assert_eq!(store.settle(wanted(&files[0])).await.expect("asked"), Completeness::Part(5));
+    assert_eq!(store.settle(wanted(&files[1])).await.expect("asked"), Completeness::Part(0));
+    assert_eq!(store.settle(wanted(last)).await.expect("asked"), Completeness::Part(4));
 }
 
 #[tokio::test]
@@ -243,16 +243,16 @@ async fn what_is_refused_for_want_of_room_leaves_nothing_behind_and_what_began_c
     assert_eq!(names(dir.path()), before);
     assert_eq!(store.fill().used_bytes, QUOTA / 2);
     // What was begun while there was room is refused in the middle, and stays.
-    let file = Wanted { length: QUOTA / 2, ..wanted(&bytes(QUOTA as usize / 2, 15)) };
+    let file = FileRef { length: QUOTA / 2, ..wanted(&bytes(QUOTA as usize / 2, 15)) };
     let piece = bytes(QUOTA as usize / 2, 15);
     store.append(file, 0, Bytes::copy_from_slice(&piece[..100])).await.expect("it fits");
     bring(&store, b"x").await.expect("a byte");
     let rest = || Bytes::copy_from_slice(&piece[100..]);
     assert!(matches!(store.append(file, 100, rest()).await, Err(Error::Full { .. })));
-    assert_eq!(store.settle(file).await.expect("asked"), Held::Part(100));
+    assert_eq!(store.settle(file).await.expect("asked"), Completeness::Part(100));
     assert_eq!(store.remove(wanted(&first).digest).await.expect("removable"), QUOTA / 2);
     store.append(file, 100, rest()).await.expect("there is room now");
-    assert_eq!(store.settle(file).await.expect("whole"), Held::Whole);
+    assert_eq!(store.settle(file).await.expect("whole"), Completeness::Whole);
 }
 
 #[tokio::test]
@@ -266,7 +266,7 @@ async fn the_disk_keeps_its_spare_bytes() {
     assert_eq!(names(dir.path()), Vec::<String>::new());
     drop(store);
     let modest = DiskContent::open(dir.path(), Room { spare_bytes: 1, ..Room::with_quota(QUOTA) }).expect("a store");
-    assert_eq!(bring(&modest, b"abc").await.expect("whole"), Held::Whole);
+    assert_eq!(bring(&modest, b"abc").await.expect("whole"), Completeness::Whole);
 }
 
 #[tokio::test]
@@ -288,7 +288,7 @@ async fn a_file_that_is_taken_away_is_gone_over_a_restart_and_its_room_is_free()
     drop(first);
     let again = store(&dir);
     assert_eq!(again.list().await.expect("listed"), []);
-    assert_eq!(bring(&again, &whole).await.expect("brought anew"), Held::Whole);
+    assert_eq!(bring(&again, &whole).await.expect("brought anew"), Completeness::Whole);
     // A cut between the name and the mark of a file leaves the mark.
     fs::write(dir.path().join(format!("{}.mark", Digest::of_content(&whole))), "{\"length\":1000,\"durable\":1000}")
         .expect("a mark");

@@ -2,7 +2,7 @@
 
 use super::EVERY;
 use crate::OtaService;
-use crate::content::{Held, Wanted};
+use crate::content::{Completeness, FileRef};
 use crate::fixture::{files, release, service};
 use midshift_bundle::digest::Digest;
 use midshift_core::reason::Code;
@@ -35,7 +35,7 @@ fn find(folder: PathBuf, name: &str) -> Option<PathBuf> {
 async fn a_file_that_was_damaged_is_not_handed_out_and_can_be_brought_again() {
     let (_dir, service, content, path) = world().await;
     let opened = service.opened().expect("keys");
-    let file = Wanted { digest: Digest::of_content(&content), length: content.len() as u64 };
+    let file = FileRef { digest: Digest::of_content(&content), length: content.len() as u64 };
     std::fs::write(&path, vec![0; content.len()]).expect("damaged");
     let refusal = opened.downloads.listed(file.digest).await.expect_err("it is damaged");
     assert_eq!(refusal.reason.code, Code::SoftwareNotFound);
@@ -45,7 +45,7 @@ async fn a_file_that_was_damaged_is_not_handed_out_and_can_be_brought_again() {
     opened.downloads.mark_damaged_reported(&damaged);
     assert!(opened.downloads.damaged().is_empty(), "it is told once");
     opened.content.append(file, 0, content.into()).await.expect("room");
-    assert_eq!(opened.content.settle(file).await.expect("whole"), Held::Whole);
+    assert_eq!(opened.content.settle(file).await.expect("whole"), Completeness::Whole);
     assert_eq!(opened.downloads.listed(file.digest).await.expect("handed out"), file);
 }
 

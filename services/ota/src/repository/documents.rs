@@ -239,7 +239,7 @@ enum Why {
 }
 
 /// Listed files that are tried again, with their names and why.
-type Missed = BTreeMap<Digest, (String, Why)>;
+type MissingFiles = BTreeMap<Digest, (String, Why)>;
 
 /// Documents that the timestamp of a folder leads to.
 struct Found {
@@ -267,11 +267,11 @@ impl Found {
     /// With its bundles, `before` being what is shown until now. A file that is gone is told and left out: the rest can be had still. One that the
     /// disk does not give, and the newest set of directive keys also if it is gone, is what it was in `before`, since its name is its digest,
     /// and is noted as unread.
-    async fn complete(self, content: &dyn Content, before: Option<&Newest>) -> Result<(Newest, Missed), Error> {
+    async fn complete(self, content: &dyn Content, before: Option<&Newest>) -> Result<(Newest, MissingFiles), Error> {
         let files = listed(&self.targets.bytes)?;
         let again = before.filter(|before| before.timestamp == self.timestamp);
         let is_known = |file: &FileTarget| again.is_some_and(|again| !again.unread.contains(&file.digest));
-        let (mut releases, mut unread) = (Vec::new(), Missed::new());
+        let (mut releases, mut unread) = (Vec::new(), MissingFiles::new());
         for file in files.iter().filter(|file| check::is_manifest(file)) {
             let known = |newest: &Newest| newest.releases.iter().find(|r| r.digest == file.digest).cloned();
             if is_known(file) {
@@ -320,7 +320,7 @@ impl Found {
 }
 
 /// Says once that files cannot be read, and once that they can again.
-fn tell_unread(before: Option<&Newest>, unread: &Missed) {
+fn tell_unread(before: Option<&Newest>, unread: &MissingFiles) {
     let is_known = |digest: &Digest| before.is_some_and(|before| before.unread.contains(digest));
     for (digest, (file, why)) in unread.iter().filter(|(digest, _)| !is_known(digest)) {
         match why {

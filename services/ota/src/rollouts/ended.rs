@@ -11,8 +11,8 @@ use midshift_core::rows::{Key, RowSelection, Table};
 use midshift_store::Error;
 use std::collections::BTreeSet;
 
-/// What is to be read.
-pub(super) struct Wanted {
+/// What is to be read of ended roll-outs.
+pub(super) struct EndedQuery {
     /// Roll-outs that the projection names.
     named: BTreeSet<RolloutId>,
     keys: Vec<Key>,
@@ -20,7 +20,7 @@ pub(super) struct Wanted {
 
 impl Loop {
     /// What the projection, `requests` and open questions want to know and is not in the projection.
-    pub(super) fn wanted(&self, requests: &[Request]) -> Wanted {
+    pub(super) fn wanted(&self, requests: &[Request]) -> EndedQuery {
         let named = self.view.wanted();
         let mut ids: BTreeSet<RolloutId> =
             self.questions.iter().flat_map(|question| &question.about).cloned().collect();
@@ -36,10 +36,10 @@ impl Loop {
         }
         ids.retain(|id| !self.view.rollouts.contains_key(id.as_str()));
         keys.extend(ids.union(&named).map(|id| Key::new(Table::Rollout, id.as_str())));
-        Wanted { named, keys }
+        EndedQuery { named, keys }
     }
     /// Reads it into the projection.
-    pub(super) async fn read_wanted(&mut self, Wanted { named, keys }: Wanted) -> Result<(), Error> {
+    pub(super) async fn read_wanted(&mut self, EndedQuery { named, keys }: EndedQuery) -> Result<(), Error> {
         if keys.is_empty() {
             return Ok(());
         }

@@ -8,7 +8,7 @@
 use super::directives::Signer;
 use super::releases;
 use super::requests::{PendingCommand, Question, Request};
-use crate::collect::Named;
+use crate::collect::NamedBundles;
 use crate::service::OtaService;
 use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
@@ -378,7 +378,7 @@ impl Loop {
             self.say_at_ms = served_ms + limits::COLLECT_EVERY_MS;
             self.view.forget_contacts(&self.board);
             // From rows that are committed, as answers are.
-            opened.named.send_replace(Some(Named { bundles: needed_bundles(&self.view, &now), served_ms }));
+            opened.named.send_replace(Some(NamedBundles { bundles: needed_bundles(&self.view, &now), served_ms }));
         }
         Ok(more)
     }

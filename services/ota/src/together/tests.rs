@@ -1,11 +1,11 @@
 //! Two processes that sign and one that reads, over one folder: nothing forks, nothing goes back, nothing is lost with one of them.
 
-use crate::collect::{Collected, Named};
-use crate::content::{Error, Held, Room, Wanted};
+use crate::collect::{CollectionOutcome, NamedBundles};
+use crate::content::{Completeness, Error, FileRef, Room};
 use crate::downloads::Downloads;
 use crate::fixture::{SEEDS, START, files, first_root, noise, robot, root, targets, write_keys};
 use crate::folder::Owner;
-use crate::opened::Opened;
+use crate::open_folder::OpenFolder;
 use crate::repository::{self, Act, FRESHEN_AFTER_MS};
 use crate::{OtaReader, OtaService, Parts};
 use bytes::Bytes;
@@ -88,12 +88,12 @@ impl Site {
     }
 }
 
-fn opened(service: &OtaService) -> &Opened {
+fn opened(service: &OtaService) -> &OpenFolder {
     service.opened().expect("keys")
 }
 
-fn wanted(content: &[u8]) -> Wanted {
-    Wanted { digest: Digest::of_content(content), length: content.len() as u64 }
+fn wanted(content: &[u8]) -> FileRef {
+    FileRef { digest: Digest::of_content(content), length: content.len() as u64 }
 }
 
 async fn append(service: &OtaService, content: &[u8], range: std::ops::Range<usize>) -> Result<(), Error> {
@@ -101,13 +101,13 @@ async fn append(service: &OtaService, content: &[u8], range: std::ops::Range<usi
     opened(service).content.append(wanted(content), range.start as u64, piece).await
 }
 
-async fn settle(service: &OtaService, content: &[u8]) -> Held {
+async fn settle(service: &OtaService, content: &[u8]) -> Completeness {
     opened(service).content.settle(wanted(content)).await.expect("asked")
 }
 
 async fn bring(service: &OtaService, content: &[u8]) {
     append(service, content, 0..content.len()).await.expect("room");
-    assert_eq!(settle(service, content).await, Held::Whole);
+    assert_eq!(settle(service, content).await, Completeness::Whole);
 }
 
 async fn has(service: &OtaService, content: &[u8]) -> bool {
@@ -122,7 +122,7 @@ async fn publish(
     expected: u64,
 ) -> Result<Vec<u8>, repository::Error> {
     for (_, content) in files {
-        if settle(service, content).await != Held::Whole {
+        if settle(service, content).await != Completeness::Whole {
             bring(service, content).await;
         }
     }
@@ -151,10 +151,10 @@ async fn a_file_that_is_brought_to_two_processes_grows_in_each_from_where_it_end
     append(&two, &content, 400..700).await.expect("from where it ends");
     let early = append(&one, &content, 400..700).await;
     assert!(matches!(early, Err(Error::Moved { at: 700, offset: 400 })), "{early:?}");
-    assert_eq!(settle(&one, &content).await, Held::Part(700));
+    assert_eq!(settle(&one, &content).await, Completeness::Part(700));
     append(&one, &content, 700..1000).await.expect("the rest");
-    assert_eq!(settle(&two, &content).await, Held::Whole);
-    assert_eq!(settle(&one, &content).await, Held::Whole);
+    assert_eq!(settle(&two, &content).await, Completeness::Whole);
+    assert_eq!(settle(&one, &content).await, Completeness::Whole);
     assert!(has(&one, &content).await && has(&two, &content).await);
 }
 
@@ -165,9 +165,9 @@ async fn an_upload_goes_on_in_another_process_when_the_one_that_had_it_is_gone()
     let content = noise(2, 1000);
     append(&one, &content, 0..400).await.expect("never acknowledged");
     drop(one);
-    assert_eq!(settle(&two, &content).await, Held::Part(400));
+    assert_eq!(settle(&two, &content).await, Completeness::Part(400));
     append(&two, &content, 400..1000).await.expect("the rest");
-    assert_eq!(settle(&two, &content).await, Held::Whole);
+    assert_eq!(settle(&two, &content).await, Completeness::Whole);
 }
 
 #[tokio::test]
@@ -179,11 +179,11 @@ async fn what_was_cut_between_two_steps_of_an_upload_is_mended_by_the_next_turn(
     // A part without its word, and a word without its part.
     fs::write(files.join(format!("{digest}.part")), b"xyz").expect("written");
     fs::write(files.join(format!("{}.mark", Digest::of_content(b"x"))), b"{}").expect("written");
-    assert_eq!(settle(&two, &content).await, Held::Part(0));
+    assert_eq!(settle(&two, &content).await, Completeness::Part(0));
     bring(&two, &content).await;
     // Named, and the word still there.
     fs::write(files.join(format!("{digest}.mark")), b"{\"length\":1000,\"durable\":1000}").expect("written");
-    assert_eq!(settle(&two, &content).await, Held::Whole);
+    assert_eq!(settle(&two, &content).await, Completeness::Whole);
     let names: Vec<_> = fs::read_dir(&files).expect("a folder").map(|e| e.expect("an entry").file_name()).collect();
     assert_eq!(names, [std::ffi::OsString::from(digest.to_string())]);
 }
@@ -194,7 +194,7 @@ async fn after_a_loss_of_power_the_first_process_believes_only_what_was_durable(
     let content = noise(4, 1000);
     let one = site.process().await;
     append(&one, &content, 0..400).await.expect("a piece");
-    assert_eq!(settle(&one, &content).await, Held::Part(400));
+    assert_eq!(settle(&one, &content).await, Completeness::Part(400));
     drop(one);
     let part = site.folder().join("content").join(format!("{}.part", Digest::of_content(&content)));
     let mut torn = fs::read(&part).expect("the part");
@@ -202,9 +202,9 @@ async fn after_a_loss_of_power_the_first_process_believes_only_what_was_durable(
     fs::write(&part, torn).expect("what no process wrote");
     let one = site.process().await;
     let two = site.process().await;
-    assert_eq!(settle(&two, &content).await, Held::Part(400));
+    assert_eq!(settle(&two, &content).await, Completeness::Part(400));
     append(&one, &content, 400..1000).await.expect("the rest");
-    assert_eq!(settle(&two, &content).await, Held::Whole);
+    assert_eq!(settle(&two, &content).await, Completeness::Whole);
 }
 
 #[tokio::test]
@@ -348,9 +348,9 @@ async fn who_publishes_waits_for_the_one_that_takes_files_away() {
     publishing.await.expect("published");
 }
 
-async fn pass(service: &OtaService, served_ms: u64) -> Collected {
+async fn pass(service: &OtaService, served_ms: u64) -> CollectionOutcome {
     let opened = opened(service);
-    let named = Named { served_ms, ..Named::default() };
+    let named = NamedBundles { served_ms, ..NamedBundles::default() };
     let pass = opened.collector.collect(opened.content.as_ref(), &opened.repository, &named, START);
     pass.await.expect("a pass")
 }
@@ -366,7 +366,7 @@ async fn a_file_that_is_brought_again_through_the_other_process_has_its_time_ane
     File::open(&path).and_then(|file| file.set_modified(SystemTime::UNIX_EPOCH)).expect("an old file");
     pass(&one, 0).await;
     pass(&one, 1).await;
-    assert_eq!(settle(&two, &stray).await, Held::Whole, "somebody brings it");
+    assert_eq!(settle(&two, &stray).await, Completeness::Whole, "somebody brings it");
     assert_eq!(pass(&one, UNNAMED_MS + 1).await.files, 0, "its time begins anew");
     // The other makes the next passes.
     assert_eq!(pass(&two, UNNAMED_MS + 2).await.files, 0);

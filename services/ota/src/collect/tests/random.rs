@@ -45,7 +45,7 @@ impl<'a> Run<'a> {
     /// Brings all of a file or only its beginning, from where it is.
     async fn bring(&mut self, content: &[u8]) {
         let file = wanted(content);
-        let Held::Part(from) = self.shop.content.settle(file).await.expect("asked") else { return };
+        let Completeness::Part(from) = self.shop.content.settle(file).await.expect("asked") else { return };
         let end = if self.dice.below(8) == 0 { content.len() / 2 } else { content.len() };
         let piece = Bytes::copy_from_slice(&content[(from as usize).min(end)..end]);
         match self.shop.content.append(file, from, piece).await {

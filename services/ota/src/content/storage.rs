@@ -36,9 +36,9 @@ pub struct Fill {
     pub quota_bytes: u64,
 }
 
-/// A file that is here, whole or not.
+/// A file that is stored, whole or in part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Stored {
+pub struct StoredFile {
     /// Of the whole.
     pub digest: Digest,
     /// That are here.
@@ -47,18 +47,18 @@ pub struct Stored {
     pub touched: u64,
 }
 
-/// Which file.
+/// A file by its digest and length.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Wanted {
+pub struct FileRef {
     /// Of the whole.
     pub digest: Digest,
     /// Bytes of the whole.
     pub length: u64,
 }
 
-/// How much of a file is here.
+/// How much of a file is stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Held {
+pub enum Completeness {
     /// All of it, and it is what its digest says.
     Whole,
     /// So many bytes from the beginning, durable.
@@ -75,13 +75,13 @@ pub trait Content: Send + Sync + 'static {
     async fn length(&self, digest: Digest) -> Result<Option<u64>, Error>;
     /// Adds a piece at `offset`, where what is here ends. It is durable once [`Content::settle`] says so. Another length than before
     /// begins the file anew.
-    async fn append(&self, file: Wanted, offset: u64, piece: Bytes) -> Result<(), Error>;
+    async fn append(&self, file: FileRef, offset: u64, piece: Bytes) -> Result<(), Error>;
     /// Makes durable what is here of a file, checks it if it is all, and says how much it is.
-    async fn settle(&self, file: Wanted) -> Result<Held, Error>;
+    async fn settle(&self, file: FileRef) -> Result<Completeness, Error>;
     /// Bytes of a whole file, cut at its end; none: it is not here.
     async fn read(&self, digest: Digest, range: Range<u64>) -> Result<Option<Reader>, Error>;
     /// Every file that is here, whole or not, by digest.
-    async fn list(&self) -> Result<Vec<Stored>, Error>;
+    async fn list(&self) -> Result<Vec<StoredFile>, Error>;
     /// Takes a file away, whole or not, and says how many bytes that were. 0: it is not here, or a piece is being added to it. Whoever has
     /// begun to read it reads on.
     async fn remove(&self, digest: Digest) -> Result<u64, Error>;

@@ -1,6 +1,6 @@
 //! What a server with keys has open, and what it does by itself: follows the folder, signs anew in time, takes away what nobody needs.
 
-use crate::collect::{Collector, Named};
+use crate::collect::{Collector, NamedBundles};
 use crate::content::Content;
 use crate::downloads::Downloads;
 use crate::folder::FolderLock;
@@ -13,13 +13,13 @@ use tokio_util::sync::CancellationToken;
 /// People hear this long before that a document of theirs ends.
 const WARN_BEFORE_MS: u64 = 60 * 24 * 3_600_000;
 
-/// What a server with keys has open.
-pub(crate) struct Opened {
+/// The folder of releases as a server with keys has it open.
+pub(crate) struct OpenFolder {
     pub(crate) content: Arc<dyn Content>,
     pub(crate) repository: Repository,
     pub(crate) collector: Collector,
     /// What the planner said last of what is needed. None: it said nothing since the start.
-    pub(crate) named: watch::Sender<Option<Named>>,
+    pub(crate) named: watch::Sender<Option<NamedBundles>>,
     /// Whether this process keeps what was signed fresh: where several processes serve one folder, the one that plans does.
     pub(crate) leads: watch::Sender<bool>,
     pub(crate) clock: Arc<dyn Clock>,
@@ -28,7 +28,7 @@ pub(crate) struct Opened {
     pub(crate) lock: Option<FolderLock>,
 }
 
-impl Opened {
+impl OpenFolder {
     fn is_shared(&self) -> bool {
         self.lock.as_ref().is_some_and(FolderLock::is_shared)
     }
@@ -63,7 +63,7 @@ impl Opened {
         }
     }
 
-    async fn collect(&self, named: &Named) {
+    async fn collect(&self, named: &NamedBundles) {
         if !*self.leads.borrow() {
             return;
         }
