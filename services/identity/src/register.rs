@@ -214,9 +214,9 @@ mod tests {
     use super::*;
     use midshift_core::identity::{Act, Deny, Digest};
     use midshift_core::ids::SiteId;
-    use midshift_core::rows::Key;
+    use midshift_core::rows::{Key, Write};
     use midshift_core::time::{ScaledClock, Utc};
-    use midshift_store::SqliteStore;
+    use midshift_store::{MemoryStore, SqliteStore, StoreId};
 
     const NOW: Utc = Utc(1_800_000_000_000);
 
