@@ -65,8 +65,8 @@ impl Robot {
         Self::command_in(id, start, home, server, stops, enrolment)
     }
     /// Starts what lies in `home` again, at a server without login.
-    pub fn relaunch(id: &str, start: &str, home: &Path, server: &str) -> anyhow::Result<Self> {
-        Self::start(Self::command_in(id, start, home, server, None, None)?, home)
+    pub fn relaunch(id: &str, start: &str, home: &Path, server: &str, stops: SocketAddr) -> anyhow::Result<Self> {
+        Self::start(Self::command_in(id, start, home, server, Some(stops), None)?, home)
     }
     fn command_in(
         id: &str,

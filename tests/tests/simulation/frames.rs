@@ -26,7 +26,7 @@ use std::path::Path;
 const RECORD: &str = "MIDSHIFT_RECORD";
 const FILE: &str = "wire.txt";
 /// What a shift must say, as [`Frame::parts`] names it.
-const SAID: [&str; 24] = [
+const SAID: [&str; 23] = [
     ".hello",
     ".hello.previous",
     ".hello.reported.attempts",
@@ -50,7 +50,6 @@ const SAID: [&str; 24] = [
     "midshift.stop.v1.AttendResponse",
     ".attend",
     ".checkIn",
-    ".close",
 ];
 
 /// One message of a call, as it was on the wire.

@@ -5,7 +5,7 @@ use super::{Engine, all, database};
 use crate::harness::{Running, folder, free_port, in_states, midshift, until};
 use crate::rolled_out::Robot;
 use crate::room::LIMIT;
-use crate::stopped::StopServer;
+use crate::stopped::{StopServer, until_held};
 use anyhow::{Context, ensure};
 use midshift_core::site::{DEMO, text};
 use midshift_proto::task::v1::TaskState;
@@ -19,7 +19,9 @@ fn serve(dir: &Path, database: Option<&str>) -> anyhow::Result<(SocketAddr, Runn
     std::fs::write(dir.join("site.toml"), DEMO)?;
     let address = free_port()?;
     let mut command = Command::new(midshift()?);
-    command.args(["serve", "--insecure", "--no-stop", "--listen", &address.to_string(), "--data"]);
+    // Its stop service would outlive the test.
+    command.env("MIDSHIFT_NO_STOP", "true");
+    command.args(["serve", "--insecure", "--listen", &address.to_string(), "--data"]);
     command.arg(dir.join("data")).arg("--site").arg(dir.join("site.toml"));
     command.args(database.iter().flat_map(|url| ["--store", url]));
     Ok((address, Running::start(&mut command, &dir.join("server.log"))?))
@@ -38,16 +40,23 @@ async fn carries_on(engine: Engine) -> anyhow::Result<()> {
             .with_context(|| std::fs::read_to_string(dir.path().join("server.log")).unwrap_or_default())?;
         ensure!(running.iter().any(|task| task.task_id == "CARRIED"), "nothing was at work: {running:?}");
         let stop = StopServer::start(dir.path(), address).await?;
-        ensure!(stop.engaged().await?.len() == 1, "the stop that was engaged is gone");
+        let engaged = stop.engaged().await?;
+        let [stop_id] = &engaged[..] else { anyhow::bail!("one stop was engaged, and now {engaged:?} are") };
         let mut robots = Vec::new();
         for (id, start) in ROBOTS {
-            robots.push(Robot::relaunch(id, start, &dir.path().join(id), &address.to_string())?);
+            // A robot with a certificate speaks TLS.
+            std::fs::remove_file(dir.path().join(id).join("data/identity.json"))?;
+            robots.push(Robot::relaunch(id, start, &dir.path().join(id), &address.to_string(), stop.address)?);
         }
         for task in ["CARRIED", "WAITING"] {
             line.until_task(task, &[TaskState::Succeeded]).await?;
         }
-        // The other robot is in maintenance until a person says that it is not.
+        // The other robot is in maintenance and stopped until a person says that it is not.
         line.done(&["robot", "undrain", "rbt-02"])?;
+        until_held(address, &["rbt-02".to_owned()], &format!("stop:{stop_id}")).await?;
+        stop.reset(stop_id)?;
+        until_held(address, &["rbt-02".to_owned()], &format!("resume:{stop_id}")).await?;
+        line.done(&["resume", "--stop", stop_id, "--reason", "all clear"])?;
         line.until_task("FOR-THE-DRAINED", &[TaskState::Succeeded]).await?;
         for robot in &robots {
             ensure!(robot.committed()?.as_deref() == Some("1.5.0"), "it runs {:?}", robot.switch()?);

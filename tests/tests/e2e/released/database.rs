@@ -1,4 +1,4 @@
-//! What a run left as text, and back: every database as SQL, all other files as they are.
+//! What a run left as text, and back: every database as SQL, every latch as its blocks, all other files as they are.
 
 use super::run::{Left, ROBOTS};
 use crate::harness::tool;
@@ -24,6 +24,8 @@ else:
 "#;
 /// The text of a store of PostgreSQL, beside the data directory.
 const STORE: &str = "store.sql";
+/// Bytes of a block of a latch in its text.
+const BLOCK: usize = 512;
 /// Ends of the names of what each start makes anew.
 const MADE_ANEW: [&str; 5] = ["log", ".lock", "-wal", "-shm", ".sock"];
 
@@ -62,11 +64,36 @@ fn copy(from: &Path, to: &Path) -> anyhow::Result<()> {
             _ if path.is_dir() => copy(&path, &to.join(&name))?,
             Some((name, "db")) => fs::write(to.join(format!("{name}.sql")), sqlite_text(&path)?)?,
             Some((name, "sql")) => sqlite_file(&path, &to.join(format!("{name}.db")))?,
+            None if name == "latch" => fs::write(to.join(format!("{name}.blocks")), latch_text(&fs::read(&path)?))?,
+            Some((name, "latch")) => fs::write(to.join(format!("{name}.latch.blocks")), latch_text(&fs::read(&path)?))?,
+            Some((name, "blocks")) => fs::write(to.join(name), latch(&fs::read_to_string(&path)?)?)?,
             _ if MADE_ANEW.iter().any(|end| name.ends_with(end)) => {}
             _ => drop(fs::copy(&path, to.join(&name)).with_context(|| format!("copying {}", path.display()))?),
         }
     }
     Ok(())
+}
+
+/// A file of slots, most of it zeros: its length, and each block that is not zeros, a line each.
+fn latch_text(bytes: &[u8]) -> String {
+    let blocks = bytes.chunks(BLOCK).zip(0..).filter(|(block, _)| block.iter().any(|byte| *byte != 0));
+    let line = |(block, number): (&[u8], usize)| {
+        block.iter().fold(format!("{number} "), |line, byte| line + &format!("{byte:02x}")) + "\n"
+    };
+    format!("{}\n", bytes.len()) + &blocks.map(line).collect::<String>()
+}
+
+fn latch(text: &str) -> anyhow::Result<Vec<u8>> {
+    let mut lines = text.lines();
+    let mut bytes = vec![0; lines.next().context("a length")?.parse()?];
+    for line in lines {
+        let (number, hex) = line.split_once(' ').context("a block")?;
+        let from = number.parse::<usize>()? * BLOCK;
+        for at in 0..hex.len() / 2 {
+            bytes[from + at] = u8::from_str_radix(&hex[2 * at..2 * at + 2], 16)?;
+        }
+    }
+    Ok(bytes)
 }
 
 fn python(verb: &str, file: &Path) -> anyhow::Result<Command> {

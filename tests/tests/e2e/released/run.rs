@@ -10,6 +10,7 @@ use crate::rolled_out::{Doors, Robot, begin_rollout, call, done, fleet};
 use crate::room::LIMIT;
 use crate::stopped::{StopServer, until_held};
 use anyhow::ensure;
+use midshift_cli::samples::{self, Signer};
 use midshift_core::robot::Lane;
 use midshift_core::site::DEMO;
 use midshift_proto::task::v1::{Task, TaskState};
@@ -44,7 +45,19 @@ impl Line {
     fn submit(self, id: &str, robot: &str) -> anyhow::Result<()> {
         let request = format!("submit-{id}");
         let (from, to) = if robot == ROBOTS[1].0 { ("A02", "B02") } else { ("A01", "B03") };
-        let what = ["--from", from, "--to", to, "--sku", "SKU-1", "--robot", robot, "--request-id", &request];
+        let what = [
+            "--from",
+            from,
+            "--to",
+            to,
+            "--sku",
+            "SKU-1",
+            "--robot",
+            robot,
+            "--unknown-robot",
+            "--request-id",
+            &request,
+        ];
         self.done(&[&["task", "submit", "--task-id", id][..], &what].concat())
     }
     /// Waits until a task is in one of these states.
@@ -61,7 +74,8 @@ impl Line {
 pub async fn run(engine: Engine) -> anyhow::Result<Left> {
     let dir = folder()?;
     let samples = dir.path().join("samples");
-    done(&["bundle", "samples", &samples.display().to_string()])?;
+    // Settings alone: with its program a recording would have a hundred megabytes.
+    samples::make(&samples, None, Signer::Throwaway, midshift_process::clock::wall())?;
     let database = (engine == Engine::Postgres).then(|| PostgresServer::shared().database());
     let keys = samples.join("keys").display().to_string();
     let mut flags = vec!["--drain-seconds", "2", "--ota-keys", &keys];
@@ -74,7 +88,7 @@ pub async fn run(engine: Engine) -> anyhow::Result<Left> {
     work(line).await?;
     stops(line, &stop).await?;
     update(line)?;
-    leave(line, dir.path(), &mut server).await?;
+    leave(line, dir.path(), &mut server, &stop).await?;
     stop.kill()?;
     for (robot, (id, _)) in robots.iter_mut().zip(ROBOTS) {
         end(robot, &dir.path().join(id)).await?;
@@ -84,7 +98,7 @@ pub async fn run(engine: Engine) -> anyhow::Result<Left> {
 
 /// Tasks, rules, rights, and what people ask about tasks and robots.
 async fn work(line: Line) -> anyhow::Result<()> {
-    line.done(&["token", "create", "orders", "--role", "operator", "--valid", "1h"])?;
+    line.done(&["token", "create", "orders", "--role", "operator", "--valid", "1d"])?;
     line.done(&["area", "put", "hall", "--speed-limit", "1400"])?;
     line.submit("FIRST", "rbt-01")?;
     line.submit("SECOND", "rbt-02")?;
@@ -99,16 +113,14 @@ async fn work(line: Line) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A stop that is reset and resumed, and one that stays engaged where no robot is.
+/// A stop that is reset and resumed.
 async fn stops(line: Line, stop: &StopServer) -> anyhow::Result<()> {
     let stop_id = stop.stop(&["--robot", "rbt-02"])?;
     let robots = ["rbt-02".to_owned()];
     until_held(line.0, &robots, &format!("stop:{stop_id}")).await?;
     stop.reset(&stop_id)?;
     until_held(line.0, &robots, &format!("resume:{stop_id}")).await?;
-    line.done(&["resume", "--stop", &stop_id, "--reason", "all clear"])?;
-    stop.stop(&["--area", "quality"])?;
-    Ok(())
+    line.done(&["resume", "--stop", &stop_id, "--reason", "all clear"])
 }
 
 /// A release that is kept, one that the robots take back by themselves, and one that stands still half-way.
@@ -132,9 +144,10 @@ fn update(line: Line) -> anyhow::Result<()> {
     line.done(&["rollout", "pause", "walk-1.5.1", "--reason", "lunch"])
 }
 
-/// A robot is in maintenance, the other one carries something, more waits; then the power of the server goes.
-async fn leave(line: Line, dir: &Path, server: &mut Server) -> anyhow::Result<()> {
+/// A robot is in maintenance and stopped, the other one carries something, more waits; then the power of the server goes.
+async fn leave(line: Line, dir: &Path, server: &mut Server, stop: &StopServer) -> anyhow::Result<()> {
     line.done(&["robot", "drain", "rbt-02", "--reason", "oil", "--request-id", "drain-1"])?;
+    stop.stop(&["--robot", "rbt-02"])?;
     line.submit("CARRIED", "rbt-01")?;
     line.submit("WAITING", "rbt-01")?;
     line.submit("FOR-THE-DRAINED", "rbt-02")?;
