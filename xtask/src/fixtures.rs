@@ -1,4 +1,4 @@
-//! `cargo xtask fixtures record`: what a run of this version leaves, for the tests of later versions; and the .proto rules that hold against it.
+//! `cargo xtask fixtures record`: what a run of this version leaves, for the tests of later versions.
 //!
 //! Invariant: the folder of a version is written once. What a release left is a fact, and a test that fails on it is not
 //! mended by writing it anew.
@@ -7,22 +7,20 @@ use crate::e2e::{self, Way};
 use crate::fetch_tools::Tools;
 use crate::round::{Count, Round, Scope};
 use crate::workspace::Workspace;
-use crate::{parts, run};
+use crate::{buf, parts, run};
 use anyhow::{Context, Result, ensure};
 use clap::Subcommand;
 use std::path::{Path, PathBuf};
 
 /// What tests read that write something down: the folder.
 const RECORD: &str = "MIDSHIFT_RECORD";
-/// Descriptors of every .proto of a version.
-const PROTOS: &str = "protos.binpb";
 /// Names in what is kept as text.
 const KEYS: &str = "stored_keys.txt";
 
 /// What can be done with them.
 #[derive(Clone, Copy, Debug, Subcommand)]
 pub enum Verb {
-    /// Write what a run of this version leaves into tests/fixtures/VERSION, which must not be there. About five minutes.
+    /// Write what a run of this version leaves into tests/fixtures/VERSION, which must not be there. About two minutes beside the build.
     Record,
 }
 
@@ -33,12 +31,8 @@ pub fn run(workspace: &Workspace, verb: Verb) -> Result<bool> {
     }
 }
 
-fn folder(workspace: &Workspace) -> PathBuf {
-    workspace.root.join("tests/fixtures")
-}
-
 fn record(workspace: &Workspace, version: &str) -> Result<bool> {
-    let (to, part) = places(&folder(workspace), version)?;
+    let (to, part) = places(&workspace.root.join(buf::RELEASES), version)?;
     let tools = Tools::find(workspace)?;
     ensure!(parts::build(workspace)?, "the programs do not build");
     let variable = (RECORD, part.to_str().context("the folder's name is text")?);
@@ -51,9 +45,7 @@ fn record(workspace: &Workspace, version: &str) -> Result<bool> {
     ensure!(round.tests_with(&shift, Some(variable), &mut count)?, "the shift failed");
     std::fs::copy(workspace.root.join("tests/golden").join(KEYS), part.join(KEYS)).context("copying the names")?;
     let Some(tools) = &round.tools else { return Ok(false) };
-    let mut build = workspace.command(&tools.buf);
-    build.args(["build", "--exclude-source-info", "-o"]).arg(part.join(PROTOS));
-    ensure!(run::succeeds(build.current_dir(workspace.root.join("proto")))?, "the descriptors were not written");
+    ensure!(buf::describe(workspace, tools, &part)?, "the descriptors were not written");
     std::fs::rename(&part, &to).with_context(|| format!("naming {}", to.display()))?;
     run::tell_person(&format!("next: look at {}, and commit it with the release", to.display()));
     Ok(true)
@@ -76,31 +68,9 @@ fn places(fixtures: &Path, version: &str) -> Result<(PathBuf, PathBuf)> {
     Ok((to, part))
 }
 
-/// Whether the .proto files break nothing of what any recorded version says on the wire.
-pub fn breaks_nothing(workspace: &Workspace, tools: &Tools) -> Result<bool> {
-    for image in images(&folder(workspace))? {
-        let mut breaking = workspace.command(&tools.buf);
-        breaking.args(["breaking", "--against"]).arg(image);
-        if !run::succeeds(breaking.current_dir(workspace.root.join("proto")))? {
-            return Ok(false);
-        }
-    }
-    Ok(true)
-}
-
-/// What is said of .proto files by each version; an error if that is none.
-fn images(fixtures: &Path) -> Result<Vec<PathBuf>> {
-    let entries = std::fs::read_dir(fixtures).with_context(|| format!("reading {}", fixtures.display()))?;
-    let images = entries.map(|entry| Ok(entry?.path().join(PROTOS))).collect::<Result<Vec<_>>>()?;
-    let mut images: Vec<PathBuf> = images.into_iter().filter(|image| image.is_file()).collect();
-    images.sort();
-    ensure!(!images.is_empty(), "no version has left {PROTOS} in {}", fixtures.display());
-    Ok(images)
-}
-
 #[cfg(test)]
 mod tests {
-    use super::{PROTOS, images, places};
+    use super::places;
     use std::fs;
 
     #[test]
@@ -114,17 +84,5 @@ mod tests {
         let refused = places(dir.path(), "0.1.0").expect_err("refused").to_string();
         assert!(refused.contains("0.1.0 is there"), "{refused}");
         assert!(places(dir.path(), "0.2.0").is_ok());
-    }
-
-    #[test]
-    fn every_version_that_left_its_protos_is_held_against() {
-        let dir = tempfile::tempdir().expect("a folder");
-        assert!(images(dir.path()).is_err());
-        for version in ["0.1.0", "0.2.0", "none"] {
-            fs::create_dir(dir.path().join(version)).expect("made");
-        }
-        let left = ["0.1.0", "0.2.0"].map(|version| dir.path().join(version).join(PROTOS));
-        left.iter().for_each(|image| fs::write(image, "").expect("written"));
-        assert_eq!(images(dir.path()).expect("read"), left);
     }
 }

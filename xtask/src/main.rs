@@ -4,6 +4,7 @@
 //! judgement is a test. Called as `cargo xtask VERB` (an alias in `.cargo/config.toml`).
 
 mod apt;
+mod buf;
 mod clients;
 mod cores;
 mod deny;

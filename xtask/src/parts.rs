@@ -6,7 +6,7 @@
 use crate::round::{Count, Round, Scope};
 use crate::stack::{self, Which};
 use crate::workspace::Workspace;
-use crate::{clients, deny, dist, docker, e2e, engine, fixtures, quick, run};
+use crate::{buf, clients, deny, dist, docker, e2e, engine, quick, run};
 use anyhow::Result;
 use clap::ValueEnum;
 
@@ -119,9 +119,7 @@ impl Part {
             }
             Self::Buf => {
                 let Some(tools) = tools else { return Ok(false) };
-                let mut lint = workspace.command(&tools.buf);
-                Ok(run::succeeds(lint.arg("lint").current_dir(workspace.root.join("proto")))?
-                    && fixtures::breaks_nothing(workspace, tools)?)
+                Ok(buf::lint(workspace, tools)? && buf::breaks_nothing(workspace, tools)?)
             }
             Self::Build => build(workspace),
             Self::Clients => {

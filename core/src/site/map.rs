@@ -107,7 +107,7 @@ pub enum PlaceKind {
 /// How many robots a place admits at once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PlaceRule {
-    /// One.
+    /// One robot.
     Exclusive,
     /// As many as its capacity says.
     Capacity,

@@ -18,12 +18,14 @@ fn releases() -> Vec<PathBuf> {
     all
 }
 
-/// Names in blocks of a list of stored names, by the head of the block.
+/// Names in blocks of a list of stored names, by the head of the block. Keys of an object that is written by hand stand in
+/// one line.
 fn names(text: &str) -> BTreeMap<&str, BTreeSet<&str>> {
     let (mut all, mut head) = (BTreeMap::<&str, BTreeSet<&str>>::new(), "");
     for line in text.lines().filter(|line| !line.is_empty()) {
         match line.strip_prefix("    ") {
             None => head = line,
+            Some(keys) if head.ends_with("by hand") => all.entry(head).or_default().extend(keys.split(' ')),
             Some(name) => drop(all.entry(head).or_default().insert(name)),
         }
     }
@@ -116,6 +118,9 @@ fn a_name_or_word_that_is_gone_is_found_and_a_new_one_is_not() {
     assert_eq!(gone(before, "table t\n    a\n    b = x | y | z\n    c[].d\n    e\n"), [] as [String; 0]);
     assert_eq!(gone(before, "table t\n    a\n    b = x\n"), ["table t: b y", "table t: c[].d"]);
     assert_eq!(gone("table t\n    a\n", "table u\n    a\n"), ["table t: a"]);
+    let by_hand = |keys: &str| format!("cli, objects by hand\n    {keys}\n");
+    assert_eq!(gone(&by_hand("a b"), &by_hand("a b c")), [] as [String; 0]);
+    assert_eq!(gone(&by_hand("a b"), &by_hand("a c")), ["cli, objects by hand: b"]);
 }
 
 #[test]

@@ -11,6 +11,7 @@ mod clock;
 mod counted;
 mod directed;
 mod disk;
+mod frame;
 mod frames;
 mod incidents;
 mod law_names;

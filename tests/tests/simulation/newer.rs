@@ -5,7 +5,7 @@
 //! for it. What a robot writes into its files is added to in robot_agent/tests/agent/successor.rs. Invariant: what this version would have said is said
 //! too, word for word. Called by the room and by its own tests.
 
-use crate::frames::Frame;
+use crate::frame::Frame;
 use hyper::body::{Body as HttpBody, Bytes, Frame as HttpFrame, Incoming};
 use hyper::header::CONTENT_LENGTH;
 use hyper::server::conn::http2;

@@ -1,7 +1,7 @@
 //! A server of this build on the store of each release, with the robots of that run: what was open is done.
 
-use super::run::{Line, ROBOTS};
-use super::{Engine, all, database};
+use super::run::Line;
+use super::{Engine, ROBOTS, all, database};
 use crate::harness::{Running, folder, free_port, in_states, midshift, until};
 use crate::rolled_out::Robot;
 use crate::room::LIMIT;

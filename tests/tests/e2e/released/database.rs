@@ -1,6 +1,6 @@
 //! What a run left as text, and back: every database as SQL, every latch as its blocks, all other files as they are.
 
-use super::run::{Left, ROBOTS};
+use super::{Left, ROBOTS};
 use crate::harness::tool;
 use anyhow::{Context, ensure};
 use midshift_tests::postgres::PostgresServer;

@@ -23,12 +23,22 @@ mod run;
 use anyhow::ensure;
 use std::path::{Path, PathBuf};
 
+/// Robots and where they begin.
+const ROBOTS: [(&str, &str); 2] = [("rbt-01", "park-1"), ("rbt-02", "park-2")];
+/// What is left of a run when the power is gone.
+struct Left {
+    /// Everything in it: `data` of the server and its stop service, `rbt-01`, `rbt-02`.
+    dir: tempfile::TempDir,
+    /// Its database, if it is not in `data`.
+    database: Option<String>,
+}
+
 /// What is behind a store.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Engine {
-    /// Files.
+    /// Files in the data directory.
     Sqlite,
-    /// A server.
+    /// A database of a server of its own.
     Postgres,
 }
 

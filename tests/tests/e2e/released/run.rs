@@ -3,8 +3,8 @@
 //!
 //! Invariant: it waits for whatever it is to leave behind; nothing is hoped for.
 
-use super::Engine;
 use super::database::sqlite_text;
+use super::{Engine, Left, ROBOTS};
 use crate::harness::{Server, folder, in_states, until};
 use crate::rolled_out::{Doors, Robot, begin_rollout, call, done, fleet};
 use crate::room::LIMIT;
@@ -18,19 +18,9 @@ use midshift_tests::postgres::PostgresServer;
 use std::net::SocketAddr;
 use std::path::Path;
 
-/// Robots and where they begin.
-pub const ROBOTS: [(&str, &str); 2] = [("rbt-01", "park-1"), ("rbt-02", "park-2")];
 /// What a roll-out of the run is told: all robots at once, watched as briefly as can be.
 const BRIEF: [&str; 9] =
     ["--waves", "rest", "--allow-full-push", "--soak", "0s", "--probation", "1s", "--exposure-tasks", "0"];
-
-/// What is left of a run when the power is gone.
-pub struct Left {
-    /// Everything in it: `data` of the server and its stop service, `rbt-01`, `rbt-02`.
-    pub dir: tempfile::TempDir,
-    /// Its database, if it is not in `data`.
-    pub database: Option<String>,
-}
 
 /// The command line, spoken to one server.
 #[derive(Clone, Copy)]
