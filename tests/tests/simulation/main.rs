@@ -40,7 +40,7 @@ use seeds::{break_laws, elsewhere, every_seed_holds, hash_of, naive_of, own_seed
 use std::collections::BTreeMap;
 
 /// Seeds of a plain run. Each has a process of its own, so that nothing of one run reaches another.
-const SEEDS: u64 = 120;
+const SEEDS: u64 = 80;
 /// Runs with so many seeds or more must have met every fault and looked at every law; a few seeds cannot.
 const ENOUGH: u64 = 40;
 /// What must have been hit, each by evidence and not by plan.

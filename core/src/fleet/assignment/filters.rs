@@ -205,6 +205,9 @@ pub fn task(
     intake: &TaskIntake,
     now: &Now,
 ) -> Result<(), Reason> {
+    if let Some(reason) = view.unknown_rows.of_task(&task.task_id) {
+        return Err(reason.clone());
+    }
     match task.phase {
         Phase::Queued => {}
         Phase::RetryWait => return Err(Code::WaitingForRetry.into()),
