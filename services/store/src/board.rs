@@ -83,7 +83,7 @@ impl<T: Send + Sync + 'static> LiveBoard<T> {
         self.robots().newest.iter().filter_map(|(id, (_, live))| Some((id.clone(), live.clone()?))).collect()
     }
 
-    /// Up to which position of the [`crate::HeardLog`] everything is on the board; 0: it is not read from there.
+    /// Up to which position of the [`crate::HeartbeatLog`] everything is on the board; 0: it is not read from there.
     pub fn read_up_to(&self) -> u64 {
         self.read_up_to.load(Ordering::Acquire)
     }
