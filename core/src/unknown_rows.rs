@@ -40,6 +40,11 @@ impl UnknownRows {
         };
         self.0.insert(row.key.clone(), unknown);
     }
+    /// Takes over requests, which no reading of the rows brings again.
+    pub fn carry_requests(&mut self, before: &mut Self) {
+        let requests = std::mem::take(&mut before.0).into_iter().filter(|(key, _)| key.table == Table::TaskRequest);
+        self.0.extend(requests);
+    }
     /// The row can be read again, or is gone.
     pub(crate) fn forget(&mut self, key: &Key) {
         self.0.remove(key);
@@ -112,4 +117,31 @@ fn tasks_of(key: &Key, body: &Value) -> BTreeSet<TaskId> {
     let listed = asked.clone().filter_map(|ask| ask["task_ids"].as_array()).flatten();
     let named = asked.map(|ask| &ask["task_id"]).chain(listed).chain([&body["task_id"]]).filter_map(Value::as_str);
     own.into_iter().chain(named).filter_map(|id| TaskId::parse(id).ok()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::UnknownRows;
+    use crate::ids::TaskId;
+    use crate::rows::{Index, Key, Revision, Row, Table};
+    use crate::task::{TaskRequest, TaskState};
+
+    #[test]
+    fn a_request_that_cannot_be_read_is_carried_into_the_next_reading_of_rows_and_a_row_is_read_there() {
+        let aside = |rows: &mut UnknownRows, table, body: &str| {
+            let row =
+                Row { key: Key::new(table, "T2"), revision: Revision(1), index: Index::default(), body: body.into() };
+            let error = match table {
+                Table::TaskRequest => row.decode::<TaskRequest>().err(),
+                _ => row.decode::<TaskState>().err(),
+            };
+            rows.keep_aside(&row, &error.expect("a word of a newer version"));
+        };
+        let (mut before, mut next) = (UnknownRows::default(), UnknownRows::default());
+        aside(&mut before, Table::TaskRequest, r#"{"ask":{"hold":{"task_ids":["T1"]}}}"#);
+        aside(&mut before, Table::TaskState, "{}");
+        next.carry_requests(&mut before);
+        let is_aside = |id: &str| next.of_task(&TaskId::parse(id).expect("an id")).is_some();
+        assert_eq!(["T1", "T2"].map(is_aside), [true, false]);
+    }
 }

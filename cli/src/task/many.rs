@@ -10,14 +10,15 @@ use tonic::Status;
 /// Ends every task that is meant.
 pub async fn cancel(which: &TaskSelection, reason: &str, force: bool, change: &Change, out: &Out) -> Result<(), Exit> {
     let mut client = which.call.task().await?;
+    let filter = which.meant.filter()?;
     let request = v1::CancelTasksRequest {
-        filter: Some(which.meant.filter()?),
+        all: is_everything(&filter),
+        filter: Some(filter),
         request_id: change.request_id.clone(),
         reason: reason.to_owned(),
         force,
         validate_only: change.dry_run,
         page_token: String::new(),
-        all: true,
     };
     let ask = async |page_token| {
         let request = v1::CancelTasksRequest { page_token, ..request.clone() };
@@ -35,20 +36,26 @@ pub async fn resolve(
     out: &Out,
 ) -> Result<(), Exit> {
     let mut client = which.call.task().await?;
+    let filter = which.meant.filter()?;
     let request = v1::ResolveTasksRequest {
-        filter: Some(which.meant.filter()?),
+        all: is_everything(&filter),
+        filter: Some(filter),
         request_id: change.request_id.clone(),
         resolution: resolution as i32,
         reason: reason.to_owned(),
         validate_only: change.dry_run,
         page_token: String::new(),
-        all: true,
     };
     let ask = async |page_token| {
         let request = v1::ResolveTasksRequest { page_token, ..request.clone() };
         Ok(client.resolve_tasks(unary(request)).await?.into_inner().outcome)
     };
     Sum::of_pages(ask).await?.print("resolve", change, out)
+}
+
+/// Whether no flag says which tasks are meant. Else `all` is not set: a server that does not know the flag refuses the request.
+fn is_everything(filter: &v1::TaskFilter) -> bool {
+    *filter == v1::TaskFilter::default()
 }
 
 /// Outcomes of all pages together.

@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn a_grant_of_a_newer_version_permits_nothing_but_what_everybody_signed_in_may() {
+    fn a_grant_of_a_newer_version_permits_nothing_but_to_stop() {
         let scanner = holder(&["scanner", "viewer@wall:7 8"]);
         assert_eq!(scanner.grants()[1].to_string(), "viewer@wall:7 8", "it is kept as it was");
         assert!(scanner.may_call(rule(Permission::Read, Object::List)).is_err());

@@ -148,7 +148,7 @@ pub struct Grant {
 pub enum HeldGrant {
     /// One that this version knows.
     Known(Grant),
-    /// One of a newer version: it permits nothing here, and is written back as it was.
+    /// One of a newer version: it permits nothing but to stop here, and is written back as it was.
     Newer(String),
 }
 

@@ -48,8 +48,8 @@ codes! {
     TaskIdTaken = "TASK_ID_TAKEN", "A task with this id exists with another body."
         => "Choose another id or leave it empty.";
     EtagMismatch = "ETAG_MISMATCH", "The object changed since you read it." => "Read it again and decide again.";
-    NotSupportedYet = "NOT_SUPPORTED_YET", "This field is reserved and does nothing yet, so it is refused rather than ignored."
-        => "Leave it out.";
+    NotSupportedYet = "NOT_SUPPORTED_YET", "The server does not have what the request asks for, so it is refused rather than carried out in part."
+        => "Update the server, or ask without it.";
     TaskEnded = "TASK_ENDED", "The task is over and cannot be changed." => "Submit another one.";
     NotAllowedNow = "NOT_ALLOWED_NOW", "The state of the object does not allow this now." => "Read it again.";
     NotStuck = "NOT_STUCK", "The robot is not stuck on its way back from a bundle." => "`midshift robot explain ROBOT` says what it waits for.";

@@ -226,6 +226,7 @@ impl Loop {
         let mut next = FleetProjection::new(self.parts.site.clone(), self.started, now);
         next.bugs = self.parts.bugs;
         next.carry_over(&mut self.view);
+        next.unknown_rows.carry_requests(&mut self.view.unknown_rows);
         self.view = next;
         self.view.load(&snapshot.rows, snapshot.seq)?;
         // The row is as old as the last commit; this process has served on since.

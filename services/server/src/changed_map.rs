@@ -12,6 +12,11 @@ use midshift_core::time::Now;
 use midshift_store::{Store, load};
 use std::sync::Arc;
 
+/// What to try where the stored map cannot be read.
+const FORCE: &str =
+    "start the version that wrote it; or take the map of the file with --force-map, whatever is in its way";
+const FOLLOW: &str = "start the version that wrote it; or start a process with role fleet and --force-map first";
+
 /// The map to go on with, and what became of the one of the file.
 pub async fn choose(
     store: &dyn Store,
@@ -19,7 +24,7 @@ pub async fn choose(
     is_forced: bool,
     now: Now,
 ) -> anyhow::Result<(Loaded, MapChange)> {
-    let Some((row, stored)) = other_stored(store, &loaded, is_forced).await? else {
+    let Some((row, stored)) = other_stored(store, &loaded, is_forced, FORCE).await? else {
         return Ok((loaded, MapChange::Taken));
     };
     let snapshot = store.read(&alive(), named).await.context("reading what is in the way of the changed map")?;
@@ -47,7 +52,7 @@ pub async fn choose(
 
 /// The map of a process that does not plan: the stored one, which fleet plans on, whatever its own file says.
 pub async fn follow(store: &dyn Store, loaded: Loaded) -> anyhow::Result<Loaded> {
-    let Some((row, stored)) = other_stored(store, &loaded, false).await? else { return Ok(loaded) };
+    let Some((row, stored)) = other_stored(store, &loaded, false, FOLLOW).await? else { return Ok(loaded) };
     let (version, stored_version) = (loaded.site.map_version(), &row.map_version);
     tracing::info!(map_version = version, stored = stored_version, "the stored map goes on, whatever the file says");
     Ok(Loaded { site: stored, text: row.text, warnings: Vec::new() })
@@ -59,6 +64,7 @@ async fn other_stored(
     store: &dyn Store,
     loaded: &Loaded,
     is_forced: bool,
+    hint: &str,
 ) -> anyhow::Result<Option<(SiteRow, Arc<Site>)>> {
     let row = load::<SiteRow>(store, loaded.site.site_id().as_str()).await.context("reading the stored map")?;
     let Some((row, _)) = row.filter(|(row, _)| row.text != loaded.text) else { return Ok(None) };
@@ -68,9 +74,10 @@ async fn other_stored(
             tracing::warn!(%error, "the stored map cannot be read, so nobody can say what is in the way of the file's, which is forced");
             Ok(None)
         }
-        Err(error) => Err(error).context(
-            "the stored map cannot be read: a newer version may have written it\n  try: start that version; or --force-map takes the map of the file, whatever is in its way",
-        ),
+        Err(error) => {
+            let text = format!("the stored map cannot be read: a newer version may have written it\n  try: {hint}");
+            Err(anyhow::Error::new(error).context(text))
+        }
     }
 }
 

@@ -76,8 +76,12 @@ fn tables(sql: &str) -> BTreeMap<String, BTreeSet<String>> {
 
 /// What a writer that knows `before` would be refused in `now`.
 fn refused(before: &str, now: &str) -> Vec<String> {
+    let rules = |sql: &str| -> BTreeSet<String> {
+        let plain = sql.split(';').map(|statement| statement.split_whitespace().collect::<Vec<_>>().join(" "));
+        plain.filter(|s| s.starts_with("CREATE UNIQUE INDEX") || s.starts_with("CREATE TRIGGER")).collect()
+    };
+    let mut refused: Vec<String> = rules(now).difference(&rules(before)).map(|rule| format!("{rule} is new")).collect();
     let (before, now) = (tables(before), tables(now));
-    let mut refused = Vec::new();
     for (name, parts) in &before {
         let Some(after) = now.get(name) else {
             refused.push(format!("{name} is gone"));
@@ -132,4 +136,6 @@ fn an_older_writer_is_refused_by_what_it_does_not_name() {
     assert_eq!(now("UNIQUE (id, n)"), ["t: n BIGINT is gone"]);
     assert_eq!(now("n BIGINT, UNIQUE (id, n), UNIQUE (n)"), ["t: UNIQUE (n) is new"]);
     assert_eq!(refused(before, ""), ["t is gone"]);
+    let unique = format!("{before} CREATE UNIQUE INDEX u ON t (n);");
+    assert_eq!(refused(before, &unique), ["CREATE UNIQUE INDEX u ON t (n) is new"]);
 }

@@ -58,6 +58,7 @@ fn of_a_robot(words: &mut Words) {
     words.extend([("boot_id", json!("b1")), ("ring", json!("ring-1")), ("session_secret", json!("none"))]);
     let numbers = ["sent_unix_ms", "session_epoch", "seq", "mode", "protocol_versions", "first_seq", "next_seq"];
     words.extend(numbers.map(|name| (name, json!(1))));
+    words.extend([("stop_level", json!("STOP_LEVEL_NONE")), ("hardware_stop", json!("HARDWARE_STOP_NONE"))]);
     words.extend([("payload_g", json!(1000)), ("battery_permille", json!(500)), ("clock_rate_permille", json!(1000))]);
     words.insert("lane", json!("LANE_STATUS"));
     // It has just been made.

@@ -1,8 +1,10 @@
 //! One message between a robot and a server as it was on the wire, with what it is made of.
 
+use midshift_proto::convert::stop::{FromStop, ToStop};
 use midshift_proto::json::pool;
 use midshift_proto::link::v1 as link;
 use midshift_proto::session::{FromRobot, LaneAck, StatusReplay, ToRobot};
+use midshift_proto::stop::v1 as stop;
 use midshift_proto::{Parse, parse};
 use prost::Message;
 use prost_reflect::DynamicMessage;
@@ -53,7 +55,13 @@ impl Frame {
             "midshift.link.v1.SessionResponse" => through::<link::SessionResponse, ToRobot>(bytes),
             "midshift.link.v1.ReplayStatusRequest" => through::<link::ReplayStatusRequest, StatusReplay>(bytes),
             "midshift.link.v1.ReplayStatusResponse" => through::<link::ReplayStatusResponse, LaneAck>(bytes),
-            // Services and agents work with these as they are.
+            "midshift.stop.v1.AttendRequest" => through::<stop::AttendRequest, ToStop>(bytes),
+            "midshift.stop.v1.AttendResponse" => {
+                let read = stop::AttendResponse::decode(bytes).expect("a frame can be read");
+                parse::<FromStop, _>(read.clone()).unwrap_or_else(|refusal| panic!("{refusal}"));
+                read.encode_to_vec()
+            }
+            // Files and their pieces: services and agents work with these as they are.
             name => {
                 let kind = pool().get_message_by_name(name).unwrap_or_else(|| panic!("{name} is gone"));
                 let message = DynamicMessage::decode(kind, bytes).expect("a frame can be read");

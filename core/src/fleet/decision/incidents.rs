@@ -113,6 +113,8 @@ pub fn close(tx: &mut Tx, incident_id: &str, reason: &str, actor: &str) {
 pub fn open_put_aside(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     let untold: Vec<_> = view.refused.take_untold().into_iter().chain(view.unknown_rows.take_untold()).collect();
     for (reason, robot_id) in untold {
-        plan.decide(view, now, "fleet", |tx| open_once(tx, reason, robot_id.as_ref()));
+        plan.decide(view, now, "fleet", |tx| {
+            open_about(tx, reason, robot_id.as_ref(), "row");
+        });
     }
 }

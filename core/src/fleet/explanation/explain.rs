@@ -44,12 +44,13 @@ pub struct TaskExplanation {
 
 /// Explains one task; none if it is not known or has ended.
 pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) -> Option<TaskExplanation> {
-    if let Some(reason) = view.unknown_rows.of_task(task_id) {
+    let known = view.task(task_id);
+    let waits = known.is_none_or(|t| matches!(t.phase, Phase::Queued | Phase::RetryWait | Phase::Suspended));
+    if let Some(reason) = view.unknown_rows.of_task(task_id).filter(|_| waits) {
         return Some(unknown(reason.clone()));
     }
-    let task = view.task(task_id)?;
+    let task = known?;
     let intake = view.intake(task_id)?;
-    let waits = matches!(task.phase, Phase::Queued | Phase::RetryWait | Phase::Suspended);
     let position = view.queue.position(task_id);
     let goal = intake
         .spec

@@ -62,7 +62,7 @@ pub fn absorb(view: &mut FleetProjection, now: Now, board: &Board, entries: &[En
                             plan.decide(view, now, "fleet", |tx| pass_over(tx, entry));
                         }
                     }
-                    // A newer version knows the word. Until then nothing else is done with its tasks.
+                    // A newer version knows the word. Meanwhile those of its tasks that wait are offered to nobody.
                     Err(error) => {
                         plan.report.unreadable.push(format!("request {}: {error}", entry.seq.0));
                         view.unknown_rows.keep_aside(&row, &error);

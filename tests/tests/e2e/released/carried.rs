@@ -3,7 +3,7 @@
 use super::run::Line;
 use super::{Engine, ROBOTS, all, database};
 use crate::harness::{Running, folder, free_port, in_states, midshift, until};
-use crate::rolled_out::Robot;
+use crate::rolled_out::{Robot, done};
 use crate::room::LIMIT;
 use crate::stopped::{StopServer, until_held};
 use anyhow::{Context, ensure};
@@ -58,6 +58,7 @@ async fn carries_on(engine: Engine) -> anyhow::Result<()> {
         until_held(address, &["rbt-02".to_owned()], &format!("resume:{stop_id}")).await?;
         line.done(&["resume", "--stop", stop_id, "--reason", "all clear"])?;
         line.until_task("FOR-THE-DRAINED", &[TaskState::Succeeded]).await?;
+        done(&["stop", "verify", "--data", &dir.path().join("data").display().to_string()])?;
         for robot in &robots {
             ensure!(robot.committed()?.as_deref() == Some("1.5.0"), "it runs {:?}", robot.switch()?);
         }

@@ -6,8 +6,8 @@ use anyhow::{Context, ensure};
 use midshift_tests::postgres::PostgresServer;
 use std::fs;
 use std::io::Write;
-use std::os::unix::fs::DirBuilderExt;
-use std::path::Path;
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 /// A database of SQLite as SQL text, and back; the version that its owner gave it goes with it.
@@ -54,24 +54,37 @@ pub fn restore(from: &Path, dir: &Path) -> anyhow::Result<Option<String>> {
     Ok(Some(url))
 }
 
-/// Copies a folder, for its owner alone as `serve` wants it; databases become text, and texts databases.
+/// Copies a folder, for its owner alone as servers and robots want it; databases and latches become text, and texts what
+/// they are of.
 fn copy(from: &Path, to: &Path) -> anyhow::Result<()> {
     fs::DirBuilder::new().recursive(true).mode(0o700).create(to)?;
     for entry in fs::read_dir(from).with_context(|| format!("reading {}", from.display()))? {
         let path = entry?.path();
         let name = path.file_name().context("a name")?.to_string_lossy().into_owned();
-        match name.rsplit_once('.') {
-            _ if path.is_dir() => copy(&path, &to.join(&name))?,
-            Some((name, "db")) => fs::write(to.join(format!("{name}.sql")), sqlite_text(&path)?)?,
-            Some((name, "sql")) => sqlite_file(&path, &to.join(format!("{name}.db")))?,
-            None if name == "latch" => fs::write(to.join(format!("{name}.blocks")), latch_text(&fs::read(&path)?))?,
-            Some((name, "latch")) => fs::write(to.join(format!("{name}.latch.blocks")), latch_text(&fs::read(&path)?))?,
-            Some((name, "blocks")) => fs::write(to.join(name), latch(&fs::read_to_string(&path)?)?)?,
-            _ if MADE_ANEW.iter().any(|end| name.ends_with(end)) => {}
-            _ => drop(fs::copy(&path, to.join(&name)).with_context(|| format!("copying {}", path.display()))?),
-        }
+        let (stem, end) = name.rsplit_once('.').unwrap_or((&name, ""));
+        let to = match (stem, end) {
+            _ if path.is_dir() => {
+                copy(&path, &to.join(&name))?;
+                continue;
+            }
+            _ if MADE_ANEW.iter().any(|end| name.ends_with(end)) => continue,
+            (_, "db") => written(&to.join(format!("{stem}.sql")), sqlite_text(&path)?.as_bytes())?,
+            (_, "sql") => sqlite_file(&path, &to.join(format!("{stem}.db")))?,
+            ("latch", "") | (_, "latch") => {
+                written(&to.join(format!("{name}.blocks")), latch_text(&fs::read(&path)?).as_bytes())?
+            }
+            (_, "blocks") => written(&to.join(stem), &latch(&fs::read_to_string(&path)?)?)?,
+            _ => written(&to.join(&name), &fs::read(&path).with_context(|| format!("reading {}", path.display()))?)?,
+        };
+        // What a clone of the tree has may be read by all.
+        fs::set_permissions(to, fs::Permissions::from_mode(0o600))?;
     }
     Ok(())
+}
+
+fn written(path: &Path, bytes: &[u8]) -> anyhow::Result<PathBuf> {
+    fs::write(path, bytes).with_context(|| format!("writing {}", path.display()))?;
+    Ok(path.to_owned())
 }
 
 /// A file of slots, most of it zeros: its length, and each block that is not zeros, a line each.
@@ -110,10 +123,10 @@ pub fn sqlite_text(file: &Path) -> anyhow::Result<String> {
     Ok(String::from_utf8(output.stdout)?)
 }
 
-fn sqlite_file(text: &Path, file: &Path) -> anyhow::Result<()> {
+fn sqlite_file(text: &Path, file: &Path) -> anyhow::Result<PathBuf> {
     let mut child = python("load", file)?.stdin(Stdio::piped()).stderr(Stdio::piped()).spawn()?;
     child.stdin.take().context("stdin was piped")?.write_all(&fs::read(text)?)?;
     let output = child.wait_with_output()?;
     ensure!(output.status.success(), "{}: {}", file.display(), String::from_utf8_lossy(&output.stderr));
-    Ok(())
+    Ok(file.to_owned())
 }

@@ -1,7 +1,7 @@
 //! What each release from 0.2.0 on left, read and carried on by this build; and the run that leaves it.
 //!
 //! `tests/fixtures/VERSION` is written once, by `cargo xtask fixtures record` at the cut of that release, and never
-//! changed afterwards (docs/decisions/0038). What a test program without servers can hold of it is tested there: frames of
+//! changed afterwards (docs/decisions/0124). What a test program without servers can hold of it is tested there: frames of
 //! the link in tests/tests/simulation/frames.rs, schemas and stored names in tests/tests/architecture/released.rs.
 //!
 //! ```text

@@ -5,6 +5,7 @@
 
 use anyhow::{Context, ensure};
 use midshift_core::idempotency::CommandKey;
+use midshift_core::reason::Reason;
 use midshift_core::rows::{Entry, Key, Log, Record, Revision, Row, Seq, Table};
 use midshift_core::work::{InboxEntry, SharedHeartbeat};
 use midshift_core::{audit, fleet, identity, leadership, maintenance, policy, rollout, stop, task, update, work};
@@ -64,6 +65,9 @@ fn hold_entry(found: &mut Found, entry: &Entry) -> anyhow::Result<()> {
         found.count(table.name());
         let key = Key::new(table, &*entry.subject);
         return hold(&Row { key, revision: Revision(1), index: entry.index.clone(), body: body.clone() });
+    }
+    if &*entry.kind == maintenance::INCIDENT {
+        return keeps(body, &serde_json::to_string(&serde_json::from_str::<Reason>(body)?)?);
     }
     if entry.log == Log::RobotInbox {
         keeps(body, &serde_json::to_string(&serde_json::from_str::<InboxEntry>(body)?)?)?;
