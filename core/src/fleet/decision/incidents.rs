@@ -111,8 +111,11 @@ pub fn close(tx: &mut Tx, incident_id: &str, reason: &str, actor: &str) {
 
 /// Tells people of every decision, and of every row of a newer version, that was put aside since.
 pub fn open_put_aside(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
-    let untold: Vec<_> = view.refused.take_untold().into_iter().chain(view.unknown_rows.take_untold()).collect();
-    for (reason, robot_id) in untold {
+    for (reason, robot_id) in view.refused.take_untold() {
+        plan.decide(view, now, "fleet", |tx| open_once(tx, reason, robot_id.as_ref()));
+    }
+    // One call of a newer version may leave a row for each task.
+    for (reason, robot_id) in view.unknown_rows.take_untold() {
         plan.decide(view, now, "fleet", |tx| {
             open_about(tx, reason, robot_id.as_ref(), "row");
         });
