@@ -113,13 +113,22 @@ fn newest(file: &File, path: &Path) -> Result<(usize, Slot), Error> {
     if length % 2 != 0 || !slot::ROOMS.contains(&room) {
         return Err(unreadable());
     }
-    let mut bytes = vec![0; room];
     let mut whole = Vec::new();
     for at in [0, room as u64] {
-        file.read_exact_at(&mut bytes, at).map_err(|e| io_error("reading", path, e))?;
-        whole.extend(Slot::decode(&bytes).filter(|slot| slot.generation % 2 * room as u64 == at));
+        let slot = read_slot(file, at, room).map_err(|e| io_error("reading", path, e))?;
+        whole.extend(slot.filter(|slot| slot.generation % 2 * room as u64 == at));
     }
     whole.into_iter().max_by_key(|slot| slot.generation).map(|slot| (room, slot)).ok_or_else(unreadable)
+}
+
+/// The slot that begins there, if it is whole: of a slot of megabytes what is in use alone is read.
+fn read_slot(file: &File, at: u64, room: usize) -> io::Result<Option<Slot>> {
+    let mut head = [0; slot::HEAD];
+    file.read_exact_at(&mut head, at)?;
+    let Some(bytes) = slot::payload_bytes(&head, room) else { return Ok(None) };
+    let mut payload = vec![0; bytes];
+    file.read_exact_at(&mut payload, at + slot::HEAD as u64)?;
+    Ok(Slot::decode(&head, payload))
 }
 
 fn json<T: Serialize>(value: &T, path: &Path) -> Result<Vec<u8>, Error> {
@@ -192,6 +201,19 @@ mod tests {
             fs::write(&path, &bytes).unwrap();
             assert!(matches!(newest(&path), Err(Error::Unreadable { .. })), "{} bytes", bytes.len());
             assert!(LatchFile::open(&path, ROOM, String::new()).is_err(), "nor is it made anew");
+        }
+    }
+
+    #[test]
+    fn a_slot_that_says_it_is_longer_than_a_slot_leaves_the_value_before_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, mut file) = made(folder.path());
+        file.write(&"second").unwrap();
+        drop(file);
+        for length in [(ROOM - slot::HEAD + 1) as u64, u64::MAX] {
+            let file = OpenOptions::new().write(true).open(&path).unwrap();
+            file.write_all_at(&length.to_le_bytes(), ROOM as u64 + 16).unwrap();
+            assert_eq!(newest(&path).unwrap(), "first", "{length}");
         }
     }
 

@@ -7,7 +7,8 @@ use std::ops::RangeInclusive;
 /// Bytes that a slot may have.
 pub const ROOMS: RangeInclusive<usize> = 512..=16 * 1024 * 1024;
 const MARK: [u8; 8] = *b"midlatch";
-const HEAD: usize = 32;
+/// Bytes before the payload.
+pub const HEAD: usize = 32;
 const CHECK: Crc<u64> = Crc::<u64>::new(&CRC_64_XZ);
 
 /// One value with its number.
@@ -34,15 +35,23 @@ impl Slot {
         Ok(all)
     }
 
-    /// What a slot holds; none if it is not whole.
-    pub fn decode(bytes: &[u8]) -> Option<Self> {
-        let (head, rest) = bytes.split_at_checked(HEAD)?;
-        let number = |at: usize| head[at..at + 8].try_into().map(u64::from_le_bytes).ok();
-        let (generation, length, sum) = (number(8)?, number(16)?, number(24)?);
-        let payload = rest.get(..usize::try_from(length).ok()?)?;
-        let is_whole = head.starts_with(&MARK) && check(generation, payload) == sum;
-        is_whole.then(|| Self { generation, payload: payload.to_vec() })
+    /// What a slot holds, of its head and of what is read behind it; none if it is not whole.
+    pub fn decode(head: &[u8; HEAD], payload: Vec<u8>) -> Option<Self> {
+        let generation = number(head, 8);
+        let is_whole = head.starts_with(&MARK) && check(generation, &payload) == number(head, 24);
+        is_whole.then_some(Self { generation, payload })
     }
+}
+
+/// Bytes of the payload behind a head; none if a slot of this size has no room for them.
+pub fn payload_bytes(head: &[u8; HEAD], room: usize) -> Option<usize> {
+    usize::try_from(number(head, 16)).ok().filter(|bytes| *bytes <= room - HEAD)
+}
+
+fn number(head: &[u8; HEAD], at: usize) -> u64 {
+    let mut bytes = [0; 8];
+    bytes.copy_from_slice(&head[at..at + 8]);
+    u64::from_le_bytes(bytes)
 }
 
 fn check(generation: u64, payload: &[u8]) -> u64 {
