@@ -3,15 +3,14 @@
 mod adopt;
 mod software;
 mod table;
-mod target;
 
 pub use table::controls;
-pub use target::{RobotTarget, find};
 
 use super::client::{Call, Change, Exit, Guarded, follow, unary};
 use super::enrol::{self, Machine};
 use super::explain::verdict;
 use super::out::{Format, Out, few, plain};
+use super::robot_target::{RobotTarget, find_robot};
 use super::rollout;
 use super::zone;
 use clap::Subcommand;
@@ -222,14 +221,14 @@ macro_rules! command {
 /// Runs one verb.
 pub async fn run(mut verb: Verb, out: &Out) -> Result<(), Exit> {
     if let Some(one) = verb.one() {
-        one.robot_id = find(&one.call, &one.robot_id).await?;
+        one.robot_id = find_robot(&one.call, &one.robot_id).await?;
     }
     match verb {
         Verb::Ls { call } => table::list(&call, out).await,
         Verb::Get(one) => get(&one, out).await,
         Verb::Watch { call, mut ids, period } => {
             for id in &mut ids {
-                *id = find(&call, id).await?;
+                *id = find_robot(&call, id).await?;
             }
             watch(&call, ids, period, out).await
         }

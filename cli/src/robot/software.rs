@@ -1,8 +1,8 @@
 //! `midshift robot pin|unpin|unstick`, and what is shown of a robot's software.
 
-use super::target::RobotTarget;
 use crate::client::{Change, Exit, ended, unary};
 use crate::out::{Out, plain};
+use crate::robot_target::RobotTarget;
 use midshift_proto::ota::v1;
 use midshift_proto::telemetry::v1::Robot;
 

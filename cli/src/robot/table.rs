@@ -6,6 +6,7 @@ use crate::client::{Call, Exit, unary};
 use crate::endpoint::Line;
 use crate::out::{Format, Out, few};
 use crate::pages::{self, PAGE_SIZE};
+use crate::presence::{age, presence, since, wall};
 use midshift_core::time::Utc;
 use midshift_proto::convert::{ms_of, time_of};
 use midshift_proto::fleet::v1 as fleet;
@@ -13,7 +14,6 @@ use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::json::to_json;
 use midshift_proto::link::v1 as link;
 use midshift_proto::telemetry::v1;
-use prost_types::Timestamp;
 use std::collections::BTreeMap;
 use tonic::Status;
 
@@ -63,34 +63,6 @@ pub fn row(robot: &v1::Robot, control: Option<&fleet::RobotControl>, now: Option
     ]
 }
 
-/// A stretch of time in its largest unit: `1.2 s`, `3 min`, `2 h`, `5 d`.
-fn age(ms: i64) -> String {
-    let ms = ms.max(0);
-    match ms / 1_000 {
-        0..60 => format!("{}.{} s", ms / 1_000, ms % 1_000 / 100),
-        seconds @ 60..3_600 => format!("{} min", seconds / 60),
-        seconds @ 3_600..86_400 => format!("{} h", seconds / 3_600),
-        seconds => format!("{} d", seconds / 86_400),
-    }
-}
-
-/// Since when, as an age at `now` of the same clock, else as a moment.
-fn since(at: Option<&Timestamp>, now: Option<Utc>) -> String {
-    match (at.map(time_of), now) {
-        (Some(at), Some(now)) => format!(" ({})", age(now.0 - at.0)),
-        (Some(at), None) => format!(" (since {})", at.rfc3339()),
-        (None, _) => String::new(),
-    }
-}
-
-/// The moment of the server's wall clock at which a robot was shown; none: it was never heard.
-fn wall(robot: &v1::Robot) -> Option<Utc> {
-    let last = robot.last_heard.as_ref();
-    let heard = robot.receive_time.as_ref().zip(robot.age.as_ref());
-    let (at, age) = heard.or_else(|| last.and_then(|last| last.receive_time.as_ref().zip(last.age.as_ref())))?;
-    Some(Utc(time_of(at).0 + ms_of(age)))
-}
-
 /// What keeps a robot from work, by its own word and by what was decided, the gravest first, each since when; `ok` if nothing.
 fn state(robot: &v1::Robot, control: Option<&fleet::RobotControl>, now: Option<Utc>) -> String {
     let wall = wall(robot);
@@ -115,17 +87,6 @@ fn decided(control: &fleet::RobotControl, now: Option<Utc>) -> Vec<String> {
     let cordoned = control.cordon.as_ref().map(|cordoned| cordon("cordoned", cordoned));
     let holds = few(control.holds.iter().map(hold).collect());
     holds.into_iter().chain([retired, cordoned, breaker, drain].into_iter().flatten()).collect()
-}
-
-/// Whether it is heard, and if not since when; with a star if only its launcher is, which nobody proves.
-pub fn presence(robot: &v1::Robot) -> String {
-    if robot.beacon.is_some() {
-        return "UPDATING*".to_owned();
-    }
-    let word = robot.presence().as_str_name().trim_start_matches("PRESENCE_");
-    let silent = robot.presence() != v1::Presence::Online;
-    let since = if silent { since(robot.presence_since.as_ref(), wall(robot)) } else { String::new() };
-    format!("{word}{since}")
 }
 
 /// Lists all robots.
@@ -181,6 +142,7 @@ pub async fn controls(
 mod tests {
     use super::*;
     use midshift_proto::convert::{duration, timestamp};
+    use prost_types::Timestamp;
 
     const NOW: Utc = Utc(1_800_000_000_000);
 

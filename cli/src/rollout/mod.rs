@@ -19,7 +19,7 @@ pub use target::{RolloutTarget, find};
 
 use super::client::{Call, Change, Exit, unary};
 use super::out::Out;
-use super::robot::find as find_robot;
+use super::robot_target::find_robot;
 use clap::Subcommand;
 use commands::{Ask, ask, begin, show};
 use follow::Until;

@@ -7,6 +7,7 @@ use crate::client::{Call, Change, Exit, unary};
 use crate::lookup::{self, Found, whole_id};
 use crate::out::Out;
 use crate::robot;
+use crate::robot_target::find_robot;
 use midshift_core::fleet::stops::Hold;
 use midshift_core::ids::StopId;
 use midshift_proto::fleet::v1::RobotControl;
@@ -44,7 +45,7 @@ impl Resume {
             stop_id = find_stop(&call, &stop_id).await?;
         }
         for id in &mut robot {
-            *id = robot::find(&call, id).await?;
+            *id = find_robot(&call, id).await?;
         }
         for id in &mut task_ids {
             *id = TaskTarget { call: call.clone(), task_id: std::mem::take(id) }.find().await?;

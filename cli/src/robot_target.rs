@@ -1,8 +1,8 @@
 //! Finds the robot that a person names.
 
-use super::table::presence;
 use crate::client::{Call, Exit, unary};
 use crate::lookup::{self, Found, whole_id};
+use crate::presence::presence;
 use midshift_proto::telemetry::v1;
 
 /// One robot.
@@ -16,7 +16,7 @@ pub struct RobotTarget {
 }
 
 /// The whole id of a robot that the server has heard of.
-pub async fn find(call: &Call, typed: &str) -> Result<String, Exit> {
+pub async fn find_robot(call: &Call, typed: &str) -> Result<String, Exit> {
     let mut client = call.telemetry().await?;
     let listed = async {
         let filter = Some(v1::RobotFilter { robot_id_prefix: typed.to_owned(), ..v1::RobotFilter::default() });
