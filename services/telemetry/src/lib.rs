@@ -18,6 +18,7 @@ mod offset;
 pub mod precision;
 mod presence;
 mod projection;
+mod projection_feed;
 mod registry;
 mod replay;
 mod retention;
@@ -109,7 +110,7 @@ impl TelemetryService {
         Box::pin(async move {
             tokio::select! {
                 () = inner.shutdown.cancelled() => Ok(()),
-                result = projection::keeper::follow_rows(&inner) => result,
+                result = projection_feed::follow_rows(&inner) => result,
                 () = presence::write_presence(&inner) => Ok(()),
                 () = shared_heartbeats::keep_heartbeats(inner.shared.as_ref(), &inner.parts.board, &inner.projection) => Ok(()),
             }

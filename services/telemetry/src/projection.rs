@@ -2,8 +2,6 @@
 //!
 //! Invariant: telemetry only composes and sends desired state; it never changes or re-dates it.
 
-pub mod keeper;
-
 use crate::stops::SiteStops;
 use midshift_core::fleet::rows::RobotControl;
 use midshift_core::ids::{AreaId, RobotId, WaypointId};
@@ -40,10 +38,10 @@ pub struct Rows {
     pub marks: BTreeMap<String, LaneMark>,
     /// Highest durable STATUS number by (robot, ring).
     pub status: BTreeMap<(RobotId, Arc<str>), u64>,
-    desired: BTreeMap<RobotId, Sections>,
-    stops: Arc<SiteStops>,
+    pub(crate) desired: BTreeMap<RobotId, Sections>,
+    pub(crate) stops: Arc<SiteStops>,
     /// The map, as fleet keeps it; none: every robot is somewhere on the site.
-    site: Option<Arc<Site>>,
+    pub(crate) site: Option<Arc<Site>>,
 }
 
 impl Rows {
@@ -67,9 +65,9 @@ pub struct LinkProjection {
     rows: RwLock<Rows>,
     watchers: Mutex<BTreeMap<RobotId, watch::Sender<Sections>>>,
     stops: watch::Sender<Arc<SiteStops>>,
-    ready: watch::Sender<bool>,
+    pub(crate) ready: watch::Sender<bool>,
     /// Up to where the feed has been taken.
-    absorbed: watch::Sender<Seq>,
+    pub(crate) absorbed: watch::Sender<Seq>,
     /// Robots that changed otherwise than by a heartbeat.
     touched: Arc<LiveBoard<()>>,
 }
@@ -79,7 +77,7 @@ impl LinkProjection {
     pub fn rows(&self) -> RwLockReadGuard<'_, Rows> {
         self.rows.read().unwrap_or_else(PoisonError::into_inner)
     }
-    fn rows_mut(&self) -> RwLockWriteGuard<'_, Rows> {
+    pub(crate) fn rows_mut(&self) -> RwLockWriteGuard<'_, Rows> {
         self.rows.write().unwrap_or_else(PoisonError::into_inner)
     }
     /// Notes durable STATUS.
@@ -104,7 +102,7 @@ impl LinkProjection {
         self.stops.subscribe()
     }
     /// Hands the copy of the stops to sessions, if it has changed: never half of one that is read anew.
-    fn publish_stops(&self) {
+    pub(crate) fn publish_stops(&self) {
         let newest = self.rows().stops.clone();
         self.stops.send_if_modified(|old| {
             let is_new = *old != newest;
@@ -130,7 +128,7 @@ impl LinkProjection {
     pub fn touched(&self) -> Dirty<()> {
         self.touched.watch()
     }
-    fn publish(&self, robot_id: &RobotId) {
+    pub(crate) fn publish(&self, robot_id: &RobotId) {
         let watchers = self.watchers.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(sender) = watchers.get(robot_id) else { return };
         let sections = self.rows().desired.get(robot_id).cloned().unwrap_or_default();

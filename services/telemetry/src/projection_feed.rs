@@ -1,7 +1,7 @@
 //! Reads rows into the projection, and goes on with the feed.
 
-use super::{Rows, Sections};
 use crate::inner::Inner;
+use crate::projection::{Rows, Sections};
 use midshift_core::fleet::rows::SiteRow;
 use midshift_core::ids::{RobotId, StopId};
 use midshift_core::rows::{BadRow, Table};
@@ -18,7 +18,7 @@ const STORE_RETRY: Duration = Duration::from_millis(200);
 /// How often it is read anew how far other gateways have kept STATUS.
 const MARKS_EVERY: Duration = Duration::from_secs(5);
 
-struct Keeper {
+struct RowReader {
     inner: Arc<Inner>,
     /// Rows with a word of a newer version: what they are about gets nothing new, and everything else goes on.
     skipped: SkippedRows,
@@ -28,7 +28,7 @@ fn sections<'a>(rows: &'a mut Rows, robot_id: &RobotId) -> &'a mut Sections {
     rows.desired.entry(robot_id.clone()).or_default()
 }
 
-impl Fold for Keeper {
+impl Fold for RowReader {
     fn tables() -> &'static [Table] {
         &[
             Table::DesiredWork,
@@ -118,7 +118,7 @@ pub async fn follow_rows(inner: &Arc<Inner>) -> Result<(), Error> {
     let mut wake = inner.parts.store.wake();
     load_status(inner).await;
     let mut read_marks = Instant::now();
-    let mut projection = Projection::new(Keeper { inner: inner.clone(), skipped: SkippedRows::default() });
+    let mut projection = Projection::new(RowReader { inner: inner.clone(), skipped: SkippedRows::default() });
     loop {
         wake.mark_unchanged();
         match projection.advance(inner.parts.store.as_ref()).await {
