@@ -6,8 +6,9 @@
 //! 2. Two processes that lead at once still write nothing twice, since every item expects revisions. The lease only
 //!    saves them from planning in vain.
 
+use crate::item::{Expect, Item};
 use crate::limits;
-use crate::rows::{BadRow, Entry, Expect, Item, Key, Record, Revision, Row, Table, body_is_json};
+use crate::rows::{BadRow, Entry, Key, Record, Revision, Row, Table, body_is_json};
 use crate::time::LinkTime;
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
@@ -361,7 +362,7 @@ mod tests {
     }
 
     fn row(item: &Item, revision: u64) -> Row {
-        let crate::rows::Write::Put { index, body } = item.rows[0].write.clone() else { panic!("no row") };
+        let crate::item::Write::Put { index, body } = item.rows[0].write.clone() else { panic!("no row") };
         Row { key: item.rows[0].key.clone(), revision: Revision(revision), index, body }
     }
 

@@ -13,6 +13,7 @@ pub mod gates;
 pub mod idempotency;
 pub mod identity;
 pub mod ids;
+pub mod item;
 pub mod leadership;
 pub mod limits;
 pub mod maintenance;

@@ -7,10 +7,9 @@
 use crate::audit::Note;
 use crate::identity::Actor;
 use crate::ids::RobotId;
+use crate::item::{Expect, Fact, Item, RowChange, Silent, Write};
 use crate::reason::Reason;
-use crate::rows::{
-    BadRow, Entry, Expect, Fact, Item, Key, Log, Record, Revision, Row, RowChange, Silent, Table, Write, Writer,
-};
+use crate::rows::{BadRow, Entry, Key, Log, Record, Revision, Row, Table, Writer};
 use crate::time::Now;
 use crate::unknown_rows::UnknownRows;
 use std::collections::{BTreeMap, BTreeSet};

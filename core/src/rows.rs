@@ -1,14 +1,10 @@
-//! Rows as values: which tables exist, who writes them, and what one atomic item of a commit is.
+//! Rows as values: which tables exist, who writes them, and what a reader of rows and of their log gets.
 //!
 //! Invariant: each table has one writing service; the single exception is declared in [`Table::born_by`]. The store refuses
 //! any other write at run time, and the architecture test holds this list against `docs/rows.md`.
 //! A revision counts the writes of one row, from 1. Ids of rows that can be deleted are never used again, so
-//! a revision never means two things; or only after [`limits::GONE_KEPT`] ([`Table::OF_A_ROBOT`]), when nobody remembers the first.
+//! a revision never means two things; or only after [`crate::limits::GONE_KEPT`] ([`Table::OF_A_ROBOT`]), when nobody remembers the first.
 
-use crate::audit::Note;
-use crate::identity::{Actor, TokenId};
-use crate::ids::RobotId;
-use crate::limits;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -370,153 +366,6 @@ pub enum RowSelection {
 
 /// Which rows the rows just read name. What it names is read at the same moment, and asked in turn.
 pub type Naming = fn(&[Row]) -> Vec<Key>;
-
-/// What must be true of a row for its item to be applied.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Expect {
-    /// There is none.
-    Absent,
-    /// It stands at this revision.
-    At(Revision),
-}
-
-/// What happens to a row.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Write {
-    /// It becomes this.
-    Put {
-        /// Index columns.
-        index: Index,
-        /// What the row becomes, as JSON.
-        body: Arc<str>,
-    },
-    /// It goes.
-    Delete,
-    /// It was relied upon and stays as it is.
-    Keep,
-}
-
-/// One row of an item.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct RowChange {
-    /// Which row.
-    pub key: Key,
-    /// On what condition.
-    pub expect: Expect,
-    /// What is done.
-    pub write: Write,
-    /// What happened, for the log (`task.assigned`); shown by event lists and audits.
-    pub kind: &'static str,
-}
-
-/// A fact that is not a row change: a robot's event in its inbox.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Fact {
-    /// Where it is kept.
-    pub log: Log,
-    /// What it is about (`robot_id` for the inbox).
-    pub subject: Arc<str>,
-    /// What happened.
-    pub kind: &'static str,
-    /// What is said of it, as JSON.
-    pub body: Arc<str>,
-}
-
-/// All or nothing. Small on purpose: a plan is many items, so that one stale row costs one assignment and not the plan.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Item {
-    /// Who writes.
-    pub writer: Writer,
-    /// On whose behalf: a principal, a robot, or the service itself.
-    pub actor: Arc<str>,
-    /// The token that was shown for it; none: none was. Stands in the audit beside the actor.
-    pub token: Option<TokenId>,
-    /// The request behind it, if any.
-    pub request_id: Option<Arc<str>>,
-    /// Rows with their conditions, each key at most once.
-    pub rows: Vec<RowChange>,
-    /// Facts beside the rows.
-    pub facts: Vec<Fact>,
-    /// What it leaves in the audit of its writer; none: nobody asked for it.
-    pub note: Option<Box<Note>>,
-    /// A robot that must not have been heard meanwhile.
-    pub silent: Option<Silent>,
-}
-
-/// That no process has heard a robot since the newest heartbeats of all robots were read up to a position. Where only one process opens the
-/// store, its own board is the whole truth and this asks nothing.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Silent {
-    /// Which robot.
-    pub robot_id: RobotId,
-    /// Position in the log of newest heartbeats that the decision knew; 0: nothing of it.
-    pub position: u64,
-}
-
-impl Item {
-    /// An empty item of `writer` on behalf of `actor`.
-    pub fn new(writer: Writer, actor: impl Into<Actor>) -> Self {
-        let actor = actor.into();
-        Self {
-            writer,
-            token: actor.token().cloned(),
-            actor: actor.name().clone(),
-            request_id: None,
-            rows: Vec::new(),
-            facts: Vec::new(),
-            note: None,
-            silent: None,
-        }
-    }
-    /// Creates a row.
-    pub fn create<R: Record>(&mut self, record: &R, kind: &'static str) -> &mut Self {
-        self.put_row(record, Expect::Absent, kind)
-    }
-    /// Changes a row that stands at `revision`.
-    pub fn update<R: Record>(&mut self, record: &R, revision: Revision, kind: &'static str) -> &mut Self {
-        self.put_row(record, Expect::At(revision), kind)
-    }
-    /// Creates or changes a row.
-    pub fn put_row<R: Record>(&mut self, record: &R, expect: Expect, kind: &'static str) -> &mut Self {
-        let write = Write::Put { index: record.index(), body: record.body() };
-        self.rows.push(RowChange { key: record.key(), expect, write, kind });
-        self
-    }
-    /// Guards a row that is only relied upon.
-    pub fn keep_row(&mut self, key: Key, expect: Expect) -> &mut Self {
-        self.rows.push(RowChange { key, expect, write: Write::Keep, kind: "" });
-        self
-    }
-    /// Deletes a row that stands at `revision`.
-    pub fn delete(&mut self, key: Key, revision: Revision, kind: &'static str) -> &mut Self {
-        self.rows.push(RowChange { key, expect: Expect::At(revision), write: Write::Delete, kind });
-        self
-    }
-    /// Leaves this in the audit.
-    pub fn audit(&mut self, note: Note) -> &mut Self {
-        self.note = Some(Box::new(note));
-        self
-    }
-    /// Bytes that count against [`limits::GROUP_COMMIT_BYTES`]: row bodies, facts, ids.
-    pub fn bytes(&self) -> usize {
-        let rows = self.rows.iter().map(|r| {
-            let body = if let Write::Put { body, .. } = &r.write { body.len() } else { 0 };
-            body + r.key.id.len()
-        });
-        let facts = self.facts.iter().map(|f| f.body.len() + f.subject.len());
-        rows.chain(facts).sum::<usize>() + self.note.as_ref().map_or(0, |note| note.bytes())
-    }
-    /// Whether it is larger than any store takes.
-    pub fn is_too_large(&self) -> bool {
-        self.rows.len() > limits::ITEM_ROWS_MAX
-            || self.facts.len() > limits::ITEM_ROWS_MAX
-            || self.bytes() > limits::GROUP_COMMIT_BYTES
-    }
-    /// Whether it would change anything.
-    pub fn is_empty(&self) -> bool {
-        self.note.is_none() && self.facts.is_empty() && self.rows.iter().all(|r| matches!(r.write, Write::Keep))
-    }
-}
 
 /// One entry of a log: a row change with its after-image, or a fact.
 #[derive(Clone, Debug, PartialEq, Eq)]

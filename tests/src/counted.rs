@@ -4,7 +4,8 @@
 
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Item, Key, Log, Naming, Row, RowSelection, Seq, Writer};
+use midshift_core::item::Item;
+use midshift_core::rows::{Key, Log, Naming, Row, RowSelection, Seq, Writer};
 use midshift_store::{Applied, CommitError, Error, FeedPage, Query, Retention, Snapshot, Store, StoreId};
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -13,12 +13,13 @@ use midshift_core::authority::Authority;
 use midshift_core::fleet::rows::{Cordon, FleetMark, RobotControl, RobotCounter};
 use midshift_core::gates::TaskTally;
 use midshift_core::ids::{AttemptId, BundleId, RobotId, RolloutId, Subject, TaskId};
+use midshift_core::item::{Expect, Fact, Item};
 use midshift_core::robot::{Inventory, Lane, Presence};
 use midshift_core::rollout::rows::{
     Act, Bundle, OtaMark, Phase as RolloutPhase, RobotSoftware, Rollout, RolloutRobot, Step,
 };
 use midshift_core::rollout::spec::RolloutSpec;
-use midshift_core::rows::{Expect, Fact, Item, Log, Seq, Writer};
+use midshift_core::rows::{Log, Seq, Writer};
 use midshift_core::task::forms::Transport;
 use midshift_core::task::state::RequestKey;
 use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskSpec, TaskState};

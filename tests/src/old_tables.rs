@@ -9,7 +9,8 @@
 use super::old_site::{ENTRIES_KEPT, OldSite, commit, spec, submitted};
 use anyhow::Context;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Index, Item, RowChange, Table, Write as Change, Writer};
+use midshift_core::item::{Item, RowChange, Write as Change};
+use midshift_core::rows::{Index, Table, Writer};
 use midshift_process::clock::clock;
 use midshift_server::storage::{Database, Storage};
 use sqlx::postgres::PgConnectOptions;

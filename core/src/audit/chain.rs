@@ -1,9 +1,9 @@
 //! Rows of a chain: how decisions become one, how its bytes are hashed and read back.
 
 use super::note::{ANCHOR, CUT, Crowd, Head, Note};
-use crate::identity::{Actor, TokenId};
-use crate::reason::{self, Code, Refusal};
-use crate::rows::{Index, Item, Key, Record, Revision, Row, Table, Writer, body_is_json};
+use crate::identity::TokenId;
+use crate::reason::Code;
+use crate::rows::{Index, Key, Record, Revision, Row, Table, Writer, body_is_json};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -62,22 +62,6 @@ pub struct By {
     pub request_id: Option<Arc<str>>,
     /// UTC of the wall when committed, unix ms.
     pub at_unix_ms: i64,
-}
-
-/// An item that says alone that something was refused as things are. None: what is wrong in form, or is about nothing that there is, is no
-/// decision.
-pub fn refusal(
-    writer: Writer,
-    actor: impl Into<Actor>,
-    request_id: Option<&str>,
-    note: Note,
-    why: &Refusal,
-) -> Option<Item> {
-    let is_decision = matches!(why.kind(), reason::Kind::Precondition | reason::Kind::Conflict | reason::Kind::Denied);
-    let mut item = Item::new(writer, actor);
-    item.request_id = request_id.map(Into::into);
-    item.audit(note.refused(why.reason.code));
-    is_decision.then_some(item)
 }
 
 /// What one row is going to say, while more may come to it.

@@ -9,7 +9,7 @@ mod verify;
 
 pub use chain::{
     AuditRow, By, DONE, Draft, FleetAudit, IdentityAudit, Kind, Opened, OtaAudit, StopAudit, TaskAudit, append, id_of,
-    link, open, refusal,
+    link, open,
 };
 pub use note::{ANCHOR, CUT, Crowd, Head, NOTHING, Note};
 pub use verify::{Broken, Chain, Ends, Export, Held, Mark, Verified};

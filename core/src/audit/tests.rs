@@ -1,7 +1,8 @@
 use super::*;
 use crate::audit::note::NOTHING;
 use crate::audit::verify::{Broken, Chain, Ends, Export, Held, Mark, Verified};
-use crate::reason::{Kind as RefusalKind, Reason};
+use crate::item::Item;
+use crate::reason::{Kind as RefusalKind, Reason, Refusal};
 use crate::time::Utc;
 use proptest::prelude::*;
 
@@ -200,7 +201,7 @@ fn a_head_that_was_noted_down_is_read_again_as_it_was_printed() {
 #[test]
 fn a_refusal_as_things_are_is_noted_and_a_mistake_of_form_is_not() {
     let refusal = |kind, code| crate::reason::Refusal::new(kind, Reason::from(code));
-    let of = |why: &Refusal| super::refusal(Writer::Fleet, "anna", Some("q"), Note::new("robot.drain"), why);
+    let of = |why: &Refusal| Item::for_refusal(Writer::Fleet, "anna", Some("q"), Note::new("robot.drain"), why);
     let item = of(&refusal(RefusalKind::Precondition, Code::RobotDraining)).expect("a decision");
     assert_eq!(item.note.as_ref().and_then(|note| note.refused), Some(Code::RobotDraining));
     assert!(!item.is_empty() && item.rows.is_empty());

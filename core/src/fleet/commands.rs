@@ -1,7 +1,7 @@
 //! What people ask of fleet directly: cordon, uncordon and retire, a word about a load, rules of an area, clearing a place, closing an
 //! incident. Each is one item, answered after its commit.
 
-use crate::audit::{self, Note};
+use crate::audit::Note;
 use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::maintenance::drain;
@@ -12,10 +12,11 @@ use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::{arrivals, claims, load};
 use crate::identity::Caller;
 use crate::ids::{AttemptId, RobotId};
+use crate::item::Item;
 use crate::limits;
 use crate::reason::{Code, Kind, Reason, Refusal, Violations};
 use crate::robot::Presence;
-use crate::rows::{Item, Record, Revision, Writer};
+use crate::rows::{Record, Revision, Writer};
 use crate::task::raw::check_labels;
 use crate::time::Now;
 use std::collections::{BTreeMap, BTreeSet};
@@ -237,7 +238,7 @@ pub fn refusal(
     request_id: Option<&str>,
     why: &Refusal,
 ) -> Option<Item> {
-    audit::refusal(Writer::Fleet, by, request_id, note(view, command), why)
+    Item::for_refusal(Writer::Fleet, by, request_id, note(view, command), why)
 }
 
 /// Carries out a command that passed its check.

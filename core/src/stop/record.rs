@@ -5,7 +5,8 @@ use super::scope::Scope;
 use crate::audit::Note;
 use crate::identity::Actor;
 use crate::ids::StopId;
-use crate::rows::{Expect, Index, Item, Record, Revision, Table, Writer, body_is_json};
+use crate::item::{Expect, Item};
+use crate::rows::{Index, Record, Revision, Table, Writer, body_is_json};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 

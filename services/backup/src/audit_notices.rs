@@ -8,7 +8,8 @@
 use super::{Access, AccessOutcome, Summary};
 use anyhow::Context;
 use midshift_core::audit::Note;
-use midshift_core::rows::{Item, Writer};
+use midshift_core::item::Item;
+use midshift_core::rows::Writer;
 use midshift_core::time::Utc;
 use midshift_store::{CommitError, Store};
 use serde::{Deserialize, Serialize};

@@ -11,7 +11,8 @@ use midshift_core::identity::{
     Act as By, Digest as KeyDigest, Revocation, RobotIdentity, TokenId, TokenRecord, revocations,
 };
 use midshift_core::ids::{RobotId, SiteId};
-use midshift_core::rows::{Expect, Index, Item, Key, RowChange, Seq, Table, Write, Writer};
+use midshift_core::item::{Expect, Item, RowChange, Write};
+use midshift_core::rows::{Index, Key, Seq, Table, Writer};
 use midshift_core::time::Utc;
 use midshift_identity::RevocationList;
 use midshift_ota::content::{Completeness, Content, DiskContent, FileRef, Room};

@@ -9,10 +9,11 @@ use midshift_core::fleet::commands;
 use midshift_core::fleet::{LOGS, Tx, follow_rows, objects, reread};
 use midshift_core::idempotency;
 use midshift_core::identity::Actor;
+use midshift_core::item::Item;
 use midshift_core::limits;
 use midshift_core::projection;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rows::{Entry, Item, Key, Table};
+use midshift_core::rows::{Entry, Key, Table};
 use midshift_store::{CommitError, Error, follow};
 
 impl Loop {

@@ -4,13 +4,14 @@
 //! 1. A decision is told to the ports of this process before its answer leaves; other processes hear of it with the store's wake.
 //! 2. A row that goes is gone here too, whichever process took it away.
 
-use midshift_core::audit::{self, Note};
+use midshift_core::audit::Note;
 use midshift_core::identity::{
     Actor, Authority, Directory, RobotIdentity, ServerCertificate, TokenId, TokenName, TokenRecord,
 };
 use midshift_core::ids::RobotId;
+use midshift_core::item::{Expect, Item};
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rows::{BadRow, Expect, Item, Record, Revision, Table, Writer};
+use midshift_core::rows::{BadRow, Record, Revision, Table, Writer};
 use midshift_core::time::Clock;
 use midshift_store::{Change, CommitError, Error, Fold, Projection, Store};
 use std::collections::BTreeMap;
@@ -177,7 +178,7 @@ impl Register {
     ) -> Result<T, Refusal> {
         let decided = self.decide(decide).await;
         if let Err(refusal) = &decided {
-            let item = audit::refusal(Writer::Identity, actor, None, note, refusal);
+            let item = Item::for_refusal(Writer::Identity, actor, None, note, refusal);
             drop(self.store.commit(item.into_iter().collect()).await);
         }
         decided
@@ -214,7 +215,8 @@ mod tests {
     use super::*;
     use midshift_core::identity::{Act, Deny, Digest};
     use midshift_core::ids::SiteId;
-    use midshift_core::rows::{Key, Write};
+    use midshift_core::item::Write;
+    use midshift_core::rows::Key;
     use midshift_core::time::{ScaledClock, Utc};
     use midshift_store::{MemoryStore, SqliteStore, StoreId};
 

@@ -5,7 +5,8 @@
 
 use crate::tokens;
 use midshift_core::identity::{Act, Actor, Revocation, RobotIdentity, Secret, TokenName, TokenRecord};
-use midshift_core::rows::{BadRow, Expect, Item, Record, Revision, Row, Table, Writer};
+use midshift_core::item::{Expect, Item};
+use midshift_core::rows::{BadRow, Record, Revision, Row, Table, Writer};
 use midshift_core::time::Utc;
 use std::collections::BTreeMap;
 

@@ -11,8 +11,9 @@
 use midshift_core::Boxed;
 use midshift_core::fleet::rows::RobotControl;
 use midshift_core::identity::{RobotIdentity, ServerCertificate, TokenName, TokenRecord};
+use midshift_core::item::{Expect, Item};
 use midshift_core::limits;
-use midshift_core::rows::{Expect, Item, Key, Record, Row, Table, Writer};
+use midshift_core::rows::{Key, Record, Row, Table, Writer};
 use midshift_core::time::{Clock, Now, Utc};
 use midshift_store::{Cursor, Error, GET_KEYS_MAX, Query, Store, expired_rows, load};
 use std::collections::BTreeMap;

@@ -9,9 +9,10 @@ use midshift_core::audit::Note;
 use midshift_core::identity::{
     Act, Actor, Digest, Grant, HeldGrant, Permission, Role, Scope, Secret, TokenId, TokenName, TokenRecord,
 };
+use midshift_core::item::{Expect, Item};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
-use midshift_core::rows::{Expect, Item, Record, Revision, Writer};
+use midshift_core::rows::{Record, Revision, Writer};
 use midshift_core::time::{LinkDuration, Utc};
 use midshift_proto::identity::v1;
 use sha2::Digest as _;

@@ -9,11 +9,12 @@
 
 use midshift_core::Boxed;
 use midshift_core::ids::BundleId;
+use midshift_core::item::{Expect, Item};
 use midshift_core::limits;
 use midshift_core::privacy;
 use midshift_core::rollout::ended;
 use midshift_core::rollout::rows::{Bundle, Quarantine, RobotSoftware, Rollout};
-use midshift_core::rows::{Expect, Item, Key, Row, Table, Writer};
+use midshift_core::rows::{Key, Row, Table, Writer};
 use midshift_core::time::{Clock, Now, Utc};
 use midshift_store::{Cursor, Error, Query, Store, expired_rows};
 use std::collections::BTreeSet;

@@ -87,7 +87,8 @@ mod tests {
     use midshift_core::fleet::maps::Obstacle;
     use midshift_core::fleet::rows::{HolderState, Place, PlaceHolder};
     use midshift_core::ids::{PlaceId, RobotId};
-    use midshift_core::rows::{Item, Writer};
+    use midshift_core::item::Item;
+    use midshift_core::rows::Writer;
     use midshift_core::site::{CORRIDOR, PlaceKind, text};
     use midshift_core::time::{Clock, ScaledClock, Utc};
     use midshift_store::{MemoryStore, StoreId};

@@ -5,7 +5,8 @@
 
 use anyhow::Context;
 use midshift_core::audit::Note;
-use midshift_core::rows::{Item, Log, Seq, Table, Writer};
+use midshift_core::item::Item;
+use midshift_core::rows::{Log, Seq, Table, Writer};
 use midshift_core::time::{Clock, Now, Utc};
 use midshift_core::wall_clock::ACCEPTED;
 use midshift_store::{Error, Store};
@@ -143,7 +144,7 @@ mod tests {
     use midshift_cli::clock::leave_word;
     use midshift_core::audit::AuditRow;
     use midshift_core::ids::SiteId;
-    use midshift_core::rows::Fact;
+    use midshift_core::item::Fact;
     use midshift_core::wall_clock::WallClock;
     use midshift_store::{MemoryStore, Query, StoreId};
     use std::sync::Arc;

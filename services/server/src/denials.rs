@@ -4,7 +4,8 @@
 
 use midshift_cli::roles::Role;
 use midshift_core::audit::Note;
-use midshift_core::rows::{Item, Writer};
+use midshift_core::item::Item;
+use midshift_core::rows::Writer;
 use midshift_edge::Denial;
 use midshift_store::Store;
 use tokio::sync::mpsc::Receiver;

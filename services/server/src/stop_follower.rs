@@ -331,8 +331,9 @@ fn who_is_gone(rows: &[Row], skipped: &mut SkippedRows, now: &Now) -> Result<BTr
 mod tests {
     use super::*;
     use midshift_core::ids::SiteId;
+    use midshift_core::item::{Expect, Item, RowChange, Write};
     use midshift_core::robot::StopLevel;
-    use midshift_core::rows::{Expect, Index, Item, Key, Record, RowChange, Write, Writer};
+    use midshift_core::rows::{Index, Key, Record, Writer};
     use midshift_core::stop::{Scope, Stop};
     use midshift_store::{MemoryStore, StoreId};
 

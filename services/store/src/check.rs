@@ -4,7 +4,8 @@
 
 use crate::{Applied, CommitError, ID_BYTES_MAX};
 use midshift_core::audit::{By, Draft};
-use midshift_core::rows::{Entry, Expect, Fact, Index, Item, Key, Log, Revision, Row, RowChange, Seq, Table, Write};
+use midshift_core::item::{Expect, Fact, Item, RowChange, Write};
+use midshift_core::rows::{Entry, Index, Key, Log, Revision, Row, Seq, Table};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 

@@ -5,9 +5,10 @@
 use crate::{CommitError, Error, Query, Store};
 use midshift_core::Boxed;
 use midshift_core::fleet::rows::{RobotAuthority, RobotControl, RobotHolder};
+use midshift_core::item::{Expect, Item, Write};
 use midshift_core::limits;
 use midshift_core::robot::Presence;
-use midshift_core::rows::{Expect, Item, Key, Row, Table, Write, Writer};
+use midshift_core::rows::{Key, Row, Table, Writer};
 use midshift_core::time::Utc;
 use midshift_core::work::PresenceRow;
 use std::sync::Arc;

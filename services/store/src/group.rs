@@ -6,7 +6,8 @@
 use crate::audit::{Growth, Heads};
 use crate::check::{After, decide};
 use crate::{Applied, CommitError};
-use midshift_core::rows::{Entry, Item, Key, Revision, Row, Seq, Table, Writer};
+use midshift_core::item::Item;
+use midshift_core::rows::{Entry, Key, Revision, Row, Seq, Table, Writer};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 /// A revision, or the knowledge that there is no such row.

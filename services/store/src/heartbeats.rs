@@ -1,7 +1,7 @@
 //! Stores the newest heartbeat of each robot for several processes: gateways save it, and every process reads what is new.
 //!
 //! Invariant: what [`HeartbeatLog::save_newest`] has answered is what every later reader sees, and an item with
-//! [`midshift_core::rows::Silent`] is applied only if nothing of its robot was kept after the position that it names. So whoever
+//! [`midshift_core::item::Silent`] is applied only if nothing of its robot was kept after the position that it names. So whoever
 //! gives a robot's work to another knows everything that the robot relies on. Bodies are not decoded here.
 //!
 //! A process that opens its store alone needs none of this: its [`crate::LiveBoard`] is the whole truth.

@@ -15,7 +15,8 @@ use crate::{
 use async_trait::async_trait;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Item, Key, Log, Naming, Row, RowSelection, Seq, Table, Writer};
+use midshift_core::item::Item;
+use midshift_core::rows::{Entry, Key, Log, Naming, Row, RowSelection, Seq, Table, Writer};
 use midshift_core::time::Clock;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

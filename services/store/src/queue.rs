@@ -4,8 +4,9 @@
 //! callers hear of it is decided here, so that it is the same on every engine.
 
 use crate::{Applied, Cause, CommitError, Error, Retention};
+use midshift_core::item::Item;
 use midshift_core::limits;
-use midshift_core::rows::{Item, Log, Seq};
+use midshift_core::rows::{Log, Seq};
 use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;

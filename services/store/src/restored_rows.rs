@@ -2,7 +2,8 @@
 //!
 //! Invariant: a store that was restored has an id of its own, so that everybody reads its rows anew: no log has these changes, and no condition is judged.
 
-use midshift_core::rows::{Expect, Item, Key, Revision, Row, Write};
+use midshift_core::item::{Expect, Item, Write};
+use midshift_core::rows::{Key, Revision, Row};
 use std::collections::BTreeMap;
 
 /// What an item leaves of its rows; none: the row goes.

@@ -3,10 +3,9 @@
 use async_trait::async_trait;
 use midshift_core::audit::Head;
 use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::item::Item;
 use midshift_core::limits;
-use midshift_core::rows::{
-    BadRow, Entry, Item, Key, Log, Naming, Record, Revision, Row, RowSelection, Seq, Table, Writer,
-};
+use midshift_core::rows::{BadRow, Entry, Key, Log, Naming, Record, Revision, Row, RowSelection, Seq, Table, Writer};
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;

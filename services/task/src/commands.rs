@@ -6,13 +6,14 @@
 use crate::TaskService;
 use crate::admit::no_result;
 use crate::rows::{TaskRows, read, unavailable};
-use midshift_core::audit::{self, Note};
+use midshift_core::audit::Note;
 use midshift_core::fleet::rows::FleetMark;
 use midshift_core::identity::{Actor, Caller, Permission};
 use midshift_core::ids::{RequestId, RobotId, TaskId};
+use midshift_core::item::Item;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
-use midshift_core::rows::{Entry, Item, Log, Revision, Seq, Table, Writer};
+use midshift_core::rows::{Entry, Log, Revision, Seq, Table, Writer};
 use midshift_core::task::state::RequestKey;
 use midshift_core::task::{Ask, Phase, Resolution, TaskRequest};
 use midshift_proto::convert::WireEnum;
@@ -239,7 +240,7 @@ impl TaskService {
     pub(crate) async fn noted(&self, asked: &PendingCommand, fits: Result<(), Refusal>) -> Result<(), Refusal> {
         if let Err(refusal) = &fits {
             let request_id = asked.request_id.as_ref().map(RequestId::as_str);
-            let item = audit::refusal(Writer::Task, &asked.actor, request_id, asked.note(), refusal);
+            let item = Item::for_refusal(Writer::Task, &asked.actor, request_id, asked.note(), refusal);
             drop(self.commit(item.into_iter().collect()).await);
         }
         fits

@@ -18,9 +18,10 @@ mod watch;
 mod watch_state;
 
 use midshift_core::Boxed;
+use midshift_core::item::Item;
 use midshift_core::limits;
 use midshift_core::reason::Refusal;
-use midshift_core::rows::{Item, Table};
+use midshift_core::rows::Table;
 use midshift_core::site::Site;
 use midshift_core::task::TaskIntake;
 use midshift_core::task::bugs::Bugs;

@@ -5,9 +5,10 @@
 
 use crate::TaskService;
 use midshift_core::Boxed;
+use midshift_core::item::Item;
 use midshift_core::limits;
 use midshift_core::privacy;
-use midshift_core::rows::{Item, Key, Row, Table, Writer};
+use midshift_core::rows::{Key, Row, Table, Writer};
 use midshift_core::task::TaskIntake;
 use midshift_store::{Cursor, Error, Query, expired_rows};
 use std::collections::BTreeSet;

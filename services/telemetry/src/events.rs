@@ -7,8 +7,9 @@
 use crate::bugs::Bugs;
 use crate::inner::Inner;
 use midshift_core::ids::RobotId;
+use midshift_core::item::{Expect, Fact, Item};
 use midshift_core::robot::Lane;
-use midshift_core::rows::{Expect, Fact, Item, Log, Revision, Writer};
+use midshift_core::rows::{Log, Revision, Writer};
 use midshift_core::time::Utc;
 use midshift_core::work::{InboxEntry, InboxItem, LaneMark};
 use midshift_proto::session::{LaneAck, LaneBatch};

@@ -3,7 +3,8 @@
 use crate::inner::Inner;
 use midshift_core::fleet::NOT_UNDERSTOOD_SEEN;
 use midshift_core::ids::RobotId;
-use midshift_core::rows::{Fact, Item, Log, Writer};
+use midshift_core::item::{Fact, Item};
+use midshift_core::rows::{Log, Writer};
 use std::sync::Arc;
 use tokio::time::Instant;
 use tracing::field::Empty;

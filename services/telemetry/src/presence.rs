@@ -5,9 +5,10 @@
 
 use crate::inner::Inner;
 use midshift_core::ids::RobotId;
+use midshift_core::item::{Expect, Item};
 use midshift_core::limits;
 use midshift_core::robot::Presence;
-use midshift_core::rows::{Expect, Item, Record, Revision, Writer};
+use midshift_core::rows::{Record, Revision, Writer};
 use midshift_core::time::{LinkDuration, LinkTime, Utc};
 use midshift_core::work::{Live, PresenceRow};
 use midshift_store::{Query, Store};

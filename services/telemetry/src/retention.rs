@@ -4,8 +4,9 @@
 //! not come again. Called by the server now and then.
 
 use midshift_core::Boxed;
+use midshift_core::item::Item;
 use midshift_core::limits;
-use midshift_core::rows::{Item, Record, Row, Table, Writer};
+use midshift_core::rows::{Record, Row, Table, Writer};
 use midshift_core::time::{Clock, Utc};
 use midshift_core::work::{LaneMark, Session};
 use midshift_store::{Cursor, Error, FrameLog, FrameMark, Query, Store, expired_rows, load};

@@ -8,7 +8,8 @@ use midshift_agent::memory::MemoryStore as RobotMemoryStore;
 use midshift_agent::store::{Error as RobotError, Op, RobotMemory, Store as RobotStore};
 use midshift_core::audit::Head;
 use midshift_core::ids::{RobotId, SiteId};
-use midshift_core::rows::{Item, Key, Log, Naming, Row, RowSelection, Seq, Writer};
+use midshift_core::item::Item;
+use midshift_core::rows::{Key, Log, Naming, Row, RowSelection, Seq, Writer};
 use midshift_store::{
     Applied, Cause, Coarsen, CommitError, Error, FeedPage, Frame, FrameLog, FrameMark, FramesOldest, Gap, MemoryFrames,
     MemoryStore, Query, Retention, Snapshot, Store, StoreId, StoredFrame,

@@ -12,7 +12,7 @@ use hyper::server::conn::http2;
 use hyper::service::service_fn;
 use hyper::{Request, Response};
 use hyper_util::rt::{TokioExecutor, TokioIo};
-use midshift_core::rows::{Item, Write};
+use midshift_core::item::{Item, Write};
 use midshift_proto::json::pool;
 use prost::{Message, encoding};
 use prost_reflect::{DynamicMessage, MapKey, MessageDescriptor, ReflectMessage, Value};

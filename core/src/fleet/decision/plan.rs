@@ -8,7 +8,8 @@ use super::slice::Slice;
 use crate::fleet::projection::rows::FleetMark;
 use crate::fleet::projection::state::FleetProjection;
 use crate::identity::Actor;
-use crate::rows::{Item, Seq};
+use crate::item::Item;
+use crate::rows::Seq;
 use crate::time::Now;
 
 /// A decision of fleet under way.

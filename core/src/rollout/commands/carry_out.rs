@@ -8,12 +8,13 @@ use super::audit::{note, note_of_verb};
 use super::check::{check_command, is_to_retry, stuck_robots};
 use super::dry_run::{find_overlapping, members_to_start};
 use super::objects;
-use crate::audit::{self, Note};
+use crate::audit::Note;
 use crate::fleet::Board;
 use crate::gates::{Efforts, FailureEvidence};
 use crate::idempotency;
 use crate::identity::Actor;
 use crate::ids::{RobotId, RolloutId};
+use crate::item::Item;
 use crate::limits;
 use crate::reason::{Code, Reason, Refusal};
 use crate::rollout::decision::directive::NoSign;
@@ -52,7 +53,7 @@ pub fn decide_request(
     // nothing.
     let mut refused = |refusal: Refusal| {
         if *check_only == CheckOnly::No {
-            let item = audit::refusal(Writer::Ota, actor, request_id.as_deref(), note(command), &refusal);
+            let item = Item::for_refusal(Writer::Ota, actor, request_id.as_deref(), note(command), &refusal);
             plan.items.extend(item);
         }
         refusal

@@ -4,10 +4,10 @@
 
 use crate::identity::Actor;
 use crate::ids::RobotId;
+use crate::item::Item;
 use crate::maintenance::INCIDENT;
 use crate::reason::Reason;
 use crate::rollout::projection::state::RolloutProjection;
-use crate::rows::Item;
 use crate::time::Now;
 
 /// A decision of the rollout service under way.

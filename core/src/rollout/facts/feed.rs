@@ -3,13 +3,14 @@
 //! Invariant: an entry of the inbox is obeyed once; the item that obeys it writes how far the feed is consumed.
 
 use super::reports;
+use crate::item::Item;
 use crate::projection;
 use crate::reason::{Code, Reason};
 use crate::rollout::decision::plan::{Plan, Tx, incident};
 use crate::rollout::projection::ended;
 use crate::rollout::projection::rows::OtaMark;
 use crate::rollout::projection::state::RolloutProjection;
-use crate::rows::{BadRow, Entry, Item, Key, Log, Revision, Row, Seq, Table};
+use crate::rows::{BadRow, Entry, Key, Log, Revision, Row, Seq, Table};
 use crate::time::Now;
 use crate::work::InboxEntry;
 

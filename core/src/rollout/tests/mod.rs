@@ -36,6 +36,7 @@ use crate::fleet::rows::{
     DrainState, HolderState, Place, PlaceHolder, RobotAuthority, RobotControl, RobotCounter, RobotHolder,
 };
 use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId, WaypointId};
+use crate::item::{Expect, Item, Write};
 use crate::maintenance::ReleasedBy;
 use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason, Refusal};
@@ -52,7 +53,7 @@ use crate::rollout::projection::spec::{RolloutSpec, Wave};
 use crate::rollout::projection::{RolloutProjection, RowMap};
 use crate::rollout::robots::{due, machine};
 use crate::rollout::{absorb, cycle};
-use crate::rows::{Entry, Expect, Item, Key, Log, Record, Revision, Row, Seq, Table, Write};
+use crate::rows::{Entry, Key, Log, Record, Revision, Row, Seq, Table};
 use crate::site::{DEMO, PlaceKind, Site};
 use crate::time::{LinkTime, Now, SiteTime, Utc};
 use crate::update::{DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};

@@ -3,7 +3,8 @@
 use super::{Inputs, Kind, Report};
 use crate::task_summary::read_once;
 use midshift_core::ids::TaskId;
-use midshift_core::rows::{Item, Writer};
+use midshift_core::item::Item;
+use midshift_core::rows::Writer;
 use midshift_core::site::{DEMO, text};
 use midshift_core::task::forms::Transport;
 use midshift_core::task::{Phase, TaskIntake, TaskState};

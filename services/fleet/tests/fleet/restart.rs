@@ -3,9 +3,10 @@
 use crate::explain::why;
 use crate::harness::{Answer, World};
 use midshift_core::ids::RobotId;
+use midshift_core::item::Item;
 use midshift_core::reason::Code;
 use midshift_core::robot::{Mode, Presence};
-use midshift_core::rows::{Item, Writer};
+use midshift_core::rows::Writer;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::{AfterStopping, Attempt, Phase, TaskState};
 use midshift_core::work::PresenceRow;

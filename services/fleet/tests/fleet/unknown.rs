@@ -2,8 +2,9 @@
 
 use crate::explain::why;
 use crate::harness::World;
+use midshift_core::item::{Expect, Item, RowChange, Write};
 use midshift_core::reason::Code;
-use midshift_core::rows::{Expect, Index, Item, Key, RowChange, Table, Write, Writer};
+use midshift_core::rows::{Index, Key, Table, Writer};
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
 use midshift_proto::access::local;

@@ -5,8 +5,9 @@
 use super::{AuditService, page, unavailable};
 use midshift_core::audit::{Export, Note};
 use midshift_core::identity::Actor;
+use midshift_core::item::Item;
 use midshift_core::reason::{Code, Kind, Refusal};
-use midshift_core::rows::{Item, Table, Writer};
+use midshift_core::rows::{Table, Writer};
 use midshift_proto::identity::v1;
 use midshift_store::Cursor;
 use tokio::sync::mpsc;

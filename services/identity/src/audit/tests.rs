@@ -1,9 +1,10 @@
 use super::*;
 use midshift_core::audit::{AuditRow, Head, Held, Mark, Note};
 use midshift_core::ids::SiteId;
+use midshift_core::item::Item;
 use midshift_core::limits;
 use midshift_core::reason::Code as ReasonCode;
-use midshift_core::rows::{Item, Writer};
+use midshift_core::rows::Writer;
 use midshift_core::time::{Now, Utc};
 use midshift_proto::convert::timestamp;
 use midshift_proto::identity::v1;

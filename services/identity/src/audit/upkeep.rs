@@ -4,9 +4,10 @@
 
 use midshift_core::Boxed;
 use midshift_core::audit::{Head, Kind, Note, open};
+use midshift_core::item::Item;
 use midshift_core::limits;
 use midshift_core::privacy;
-use midshift_core::rows::{Item, Row, Table, Writer};
+use midshift_core::rows::{Row, Table, Writer};
 use midshift_core::time::Clock;
 use midshift_store::{CommitError, Error, Query, Store};
 use std::sync::Arc;

@@ -5,8 +5,9 @@ use crate::world::World;
 use midshift_core::fleet::rows::{Cordon, RobotControl};
 use midshift_core::identity::{Deny, Digest, EnrolmentState, RobotIdentity, ServerCertificate, TokenId};
 use midshift_core::ids::RobotId;
+use midshift_core::item::Item;
 use midshift_core::reason::Code;
-use midshift_core::rows::{Item, Record, Table, Writer};
+use midshift_core::rows::{Record, Table, Writer};
 use midshift_core::time::Utc;
 
 const DAY_S: u64 = 24 * 3_600;

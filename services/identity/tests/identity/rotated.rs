@@ -3,8 +3,9 @@
 use crate::tokens::{create, holder, list, revoke};
 use crate::world::{World, asked_by, code};
 use midshift_core::identity::{Caller, Digest, Principal, TokenId, TokenRecord};
+use midshift_core::item::Item;
 use midshift_core::reason::Code;
-use midshift_core::rows::{Item, Writer};
+use midshift_core::rows::Writer;
 use midshift_identity::IdentityService;
 use midshift_proto::access::local;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;

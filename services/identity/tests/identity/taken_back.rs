@@ -3,8 +3,9 @@
 use crate::tokens::{create, holder, revoke};
 use crate::world::{Machine, World, code, enrol, secret};
 use midshift_core::identity::{Digest, Revocation, RobotIdentity, Secret, TokenName, TokenRecord};
+use midshift_core::item::{Item, Write};
 use midshift_core::reason::Code;
-use midshift_core::rows::{Item, Record, Row, Write};
+use midshift_core::rows::{Record, Row};
 use midshift_identity::restored::{TABLES, Tokens, lets_somebody_in, put_right};
 use midshift_identity::{IdentityService, RevocationList};
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;

@@ -3,10 +3,11 @@
 use super::prune;
 use crate::old_site::{DAY_MS, OldSite, commit, robot_id};
 use midshift_core::ids::{AreaId, BundleId, RolloutId, SiteId};
+use midshift_core::item::Item;
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::rollout::rows::{Act, AreaBundle, Bundle, Phase, Quarantine, Rollout, RolloutRobot, Step};
-use midshift_core::rows::{Item, Record, Revision, Table, Writer};
+use midshift_core::rows::{Record, Revision, Table, Writer};
 use midshift_core::time::{Clock, ScaledClock, Utc};
 use midshift_store::{SqliteStore, Store, load};
 use std::collections::{BTreeMap, BTreeSet};

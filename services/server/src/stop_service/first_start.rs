@@ -86,8 +86,9 @@ async fn read_history(store: &dyn Store) -> anyhow::Result<(Option<String>, bool
 mod tests {
     use super::*;
     use midshift_core::ids::{RobotId, SiteId, StopId};
+    use midshift_core::item::Item;
     use midshift_core::robot::StopLevel;
-    use midshift_core::rows::{Item, Writer};
+    use midshift_core::rows::Writer;
     use midshift_core::stop::record::StopRecord;
     use midshift_core::stop::{Scope, Stop};
     use midshift_core::time::Utc;

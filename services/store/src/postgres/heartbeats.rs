@@ -14,7 +14,7 @@ use crate::{Error, HeartbeatLog, OpenError, SavedHeartbeats, StoredHeartbeat};
 use async_trait::async_trait;
 use midshift_core::Boxed;
 use midshift_core::ids::{RobotId, SiteId};
-use midshift_core::rows::Silent;
+use midshift_core::item::Silent;
 use sqlx::{PgConnection, PgPool, Row};
 use std::collections::BTreeSet;
 use std::sync::Arc;

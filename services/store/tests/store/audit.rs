@@ -2,7 +2,8 @@
 
 use crate::support::{at, clock, database, number, one, postgres_at, put, say, site, stranger};
 use midshift_core::audit::{AuditRow, Broken, Chain, Head, Mark, Note, Verified};
-use midshift_core::rows::{Expect, Item, Log, RowChange, Seq, Table, Write, Writer};
+use midshift_core::item::{Expect, Item, RowChange, Write};
+use midshift_core::rows::{Log, Seq, Table, Writer};
 use midshift_core::time::Utc;
 use midshift_store::{CommitError, Cursor, Query, SqliteStore, Store};
 use std::sync::Arc;

@@ -1,9 +1,8 @@
 //! The contract of a store, the same for every engine.
 
 use crate::support::{WALL, at, indexed, item, one, put};
-use midshift_core::rows::{
-    Expect, Fact, Index, Item, Key, Log, Naming, Revision, Row, RowChange, RowSelection, Seq, Table, Write, Writer,
-};
+use midshift_core::item::{Expect, Fact, Item, RowChange, Write};
+use midshift_core::rows::{Index, Key, Log, Naming, Revision, Row, RowSelection, Seq, Table, Writer};
 use midshift_store::{CommitError, Cursor, Error, Query, Retention, Store};
 use std::collections::BTreeSet;
 use std::sync::Arc;

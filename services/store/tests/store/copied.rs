@@ -3,7 +3,8 @@
 use crate::server::PostgresServer;
 use crate::support::{at, clock, database, number, one, postgres_at, put, say, site, stranger, until_a_writer_waits};
 use midshift_core::ids::RobotId;
-use midshift_core::rows::{Expect, Key, Log, Seq, Table, Writer};
+use midshift_core::item::Expect;
+use midshift_core::rows::{Key, Log, Seq, Table, Writer};
 use midshift_store::{
     CommitError, Frame, FrameLog, Gap, HeartbeatLog, OpenError, PostgresConfig, PostgresCopy, PostgresFrames,
     PostgresHeartbeats, PostgresRestore, RestoreError, Store, StoreId, StoredHeartbeat, migrate_postgres,
@@ -73,7 +74,7 @@ pub async fn used() -> PostgresConfig {
     one(&store, Writer::Fleet, vec![put(Table::Attempt, "a", Expect::Absent, odd)]).await.unwrap();
     one(&store, Writer::Fleet, vec![put(Table::Attempt, "b", Expect::Absent, "{}")]).await.unwrap();
     let mut gone = put(Table::Attempt, "b", at(1), "{}");
-    gone.write = midshift_core::rows::Write::Delete;
+    gone.write = midshift_core::item::Write::Delete;
     one(&store, Writer::Fleet, vec![gone]).await.unwrap();
     one(&store, Writer::Telemetry, vec![put(Table::Presence, "r-1", Expect::Absent, "{}")]).await.unwrap();
     let frames = frames(&config).await;

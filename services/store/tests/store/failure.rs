@@ -1,7 +1,8 @@
 //! What callers hear when the file fails under the writer, and that the writer finds its way back.
 
 use crate::support::{at, clock, one, put, site};
-use midshift_core::rows::{Expect, Key, Log, Revision, Table, Writer};
+use midshift_core::item::Expect;
+use midshift_core::rows::{Key, Log, Revision, Table, Writer};
 use midshift_store::{CommitError, SqliteStore, Store};
 use sqlx::{AssertSqlSafe, Connection, SqliteConnection};
 use std::path::Path;

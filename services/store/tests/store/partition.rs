@@ -3,7 +3,8 @@
 use crate::line::{Line, Trap};
 use crate::server::PostgresServer;
 use crate::support::{database, one, postgres_at, put, say, site, stranger, until_a_writer_waits};
-use midshift_core::rows::{Expect, Key, Table, Writer};
+use midshift_core::item::Expect;
+use midshift_core::rows::{Key, Table, Writer};
 use midshift_store::{CommitError, HeartbeatLog, PostgresConfig, PostgresHeartbeats, Store};
 use std::sync::Arc;
 use std::time::Duration;

@@ -5,7 +5,8 @@ use crate::support::{
     at, clock, database, item, number, one, postgres_at, put, say, site, stranger, until_a_writer_waits,
 };
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Expect, Key, Log, Revision, Seq, Table, Writer};
+use midshift_core::item::Expect;
+use midshift_core::rows::{Key, Log, Revision, Seq, Table, Writer};
 use midshift_store::{
     CommitError, OpenError, PostgresConfig, PostgresFrames, PostgresStore, Store, Wakes, migrate_postgres,
 };

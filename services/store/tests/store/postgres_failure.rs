@@ -2,7 +2,8 @@
 
 use crate::server::PostgresServer;
 use crate::support::{at, database, indexed, item, number, one, postgres_at, put, say, stranger};
-use midshift_core::rows::{Expect, Index, Key, Log, Revision, Table, Writer};
+use midshift_core::item::Expect;
+use midshift_core::rows::{Index, Key, Log, Revision, Table, Writer};
 use midshift_store::{CommitError, PostgresConfig, PostgresStore, Store};
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -3,7 +3,8 @@
 use crate::line::Line;
 use crate::server::{PostgresServer, Proof};
 use crate::support::{clock, one, postgres_at, put, site};
-use midshift_core::rows::{Expect, Table, Writer};
+use midshift_core::item::Expect;
+use midshift_core::rows::{Table, Writer};
 use midshift_store::{
     OpenError, PostgresConfig, PostgresCopy, PostgresFrames, PostgresHeartbeats, PostgresStore, Store, migrate_postgres,
 };

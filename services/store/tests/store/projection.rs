@@ -1,7 +1,8 @@
 //! A projection carried forward by the feed equals one built anew, whatever was committed.
 
 use crate::support::{at, item, one, put};
-use midshift_core::rows::{BadRow, Expect, Item, Key, Revision, Table, Writer};
+use midshift_core::item::{Expect, Item};
+use midshift_core::rows::{BadRow, Key, Revision, Table, Writer};
 use midshift_store::{Change, Fold, MemoryStore, Projection, Store, StoreId};
 use proptest::prelude::*;
 use std::collections::BTreeMap;

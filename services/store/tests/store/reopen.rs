@@ -2,7 +2,8 @@
 
 use crate::support::{at, clock, one, put, site};
 use midshift_core::ids::{RobotId, SiteId};
-use midshift_core::rows::{Expect, Key, Log, Revision, Seq, Table, Writer};
+use midshift_core::item::Expect;
+use midshift_core::rows::{Key, Log, Revision, Seq, Table, Writer};
 use midshift_store::{
     Error, Frame, FrameLog, Gap, MemoryFrames, OpenError, PostgresFrames, SqliteFrames, SqliteStore, Store,
 };

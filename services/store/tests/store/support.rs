@@ -2,7 +2,8 @@
 
 use crate::server::PostgresServer;
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Expect, Index, Item, Key, Revision, RowChange, Table, Write, Writer};
+use midshift_core::item::{Expect, Item, RowChange, Write};
+use midshift_core::rows::{Index, Key, Revision, Table, Writer};
 use midshift_core::time::{Clock, Now, Utc};
 use midshift_store::{
     Applied, CommitError, MemoryStore, PostgresConfig, PostgresStore, SqliteStore, Store, StoreId, migrate_postgres,

@@ -1,8 +1,9 @@
 //! Callers take turns at the one writer.
 
 use crate::support::{item, one, put, sqlite};
+use midshift_core::item::Expect;
 use midshift_core::limits::COMMIT_SLICE_ITEMS;
-use midshift_core::rows::{Expect, Table, Writer};
+use midshift_core::rows::{Table, Writer};
 
 #[tokio::test]
 async fn a_long_commit_lets_others_in_between_its_slices() {

@@ -4,8 +4,9 @@
 use crate::counted::Counted;
 use crate::world::{Watch, World, patrol, submit};
 use midshift_core::ids::{RobotId, TaskId};
+use midshift_core::item::Item;
 use midshift_core::limits;
-use midshift_core::rows::{Item, Writer};
+use midshift_core::rows::Writer;
 use midshift_core::task::{Phase, TaskIntake, TaskState};
 use midshift_proto::access::local;
 use midshift_proto::task::v1::task_service_server::TaskService as _;

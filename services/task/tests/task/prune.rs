@@ -1,7 +1,8 @@
 //! What is kept for some days, and then no longer.
 
 use crate::world::{World, count, submit, transport};
-use midshift_core::rows::{Item, Key, Table, Writer};
+use midshift_core::item::Item;
+use midshift_core::rows::{Key, Table, Writer};
 use midshift_proto::access::local;
 use midshift_proto::task::v1::task_service_server::TaskService as _;
 use midshift_proto::task::v1::{CancelTaskRequest, CancelTaskResponse};

@@ -2,7 +2,8 @@
 
 use crate::world::{World, reason, submit, transport};
 use midshift_core::ids::TaskId;
-use midshift_core::rows::{self, Writer};
+use midshift_core::item::Item as StoredItem;
+use midshift_core::rows::Writer;
 use midshift_core::task::{AttemptPhase, Phase, TaskIntake};
 use midshift_proto::access::local;
 use midshift_proto::task::v1::{self, AttemptState, TaskState, watch_tasks_response::Item};
@@ -232,7 +233,7 @@ async fn tasks_that_two_services_numbered_alike_are_told_each_for_itself() {
     let (intake, _) = load::<TaskIntake>(&*world.store, &first).await.expect("a store").expect("a task");
     let second = format!("{first}-2");
     let twin = TaskIntake { task_id: TaskId::parse(&second).expect("an id"), ..intake };
-    let mut item = rows::Item::new(Writer::Task, "wms");
+    let mut item = StoredItem::new(Writer::Task, "wms");
     item.create(&twin, "task.admitted").create(&midshift_core::task::TaskState::born(&twin), "task.born");
     world.store.commit(vec![item]).await.remove(0).expect("applied");
     assert_eq!(world.state(&first).await.0.number, world.state(&second).await.0.number, "admitted at the same moment");

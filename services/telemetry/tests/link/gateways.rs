@@ -3,8 +3,9 @@
 use crate::world::{Result, Robot, World, clock, serve};
 use async_trait::async_trait;
 use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::item::{Expect, Item};
 use midshift_core::reason::Code;
-use midshift_core::rows::{Expect, Item, Writer};
+use midshift_core::rows::Writer;
 use midshift_core::time::Clock;
 use midshift_core::work::DesiredWork;
 use midshift_proto::session::CloseCode;

@@ -3,8 +3,9 @@
 use crate::stops::{copied, hears, record};
 use crate::world::{Result, Robot, World, hello, world};
 use midshift_core::ids::RobotId;
+use midshift_core::item::{Expect, Item, RowChange, Write};
 use midshift_core::robot::Presence;
-use midshift_core::rows::{Expect, Item, Record, RowChange, Write, Writer};
+use midshift_core::rows::{Record, Writer};
 use midshift_core::stop::Scope;
 use midshift_core::work::{DesiredWork, PresenceRow};
 use midshift_proto::session::{Hello, StopFacts};

@@ -3,8 +3,9 @@
 use crate::world::{Result, Robot, World, asked_as, hello, world};
 use midshift_core::fleet::rows::SiteRow;
 use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::item::Item;
 use midshift_core::robot::Lane;
-use midshift_core::rows::{Item, Writer};
+use midshift_core::rows::Writer;
 use midshift_core::site::DEMO;
 use midshift_proto::link::v1::replay_service_client::ReplayServiceClient;
 use midshift_proto::refusal_of;

@@ -2,8 +2,9 @@
 
 use crate::world::{Result, Robot, clock, world};
 use midshift_core::ids::RobotId;
+use midshift_core::item::Item;
 use midshift_core::limits;
-use midshift_core::rows::{Item, Writer};
+use midshift_core::rows::Writer;
 use midshift_core::time::{Clock, Now, Utc};
 use midshift_core::work::{LaneMark, Session};
 use midshift_store::{Frame, FrameLog, MemoryFrames, load};

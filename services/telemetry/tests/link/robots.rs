@@ -3,8 +3,9 @@
 use crate::world::{Result, Robot, World, clock, serve, world};
 use midshift_core::fleet::rows::RobotControl;
 use midshift_core::ids::{RobotId, SiteId};
+use midshift_core::item::Item;
 use midshift_core::robot::{Inventory, Mode, ReportedState, Vitals};
-use midshift_core::rows::{Item, Writer};
+use midshift_core::rows::Writer;
 use midshift_core::time::Clock;
 use midshift_core::work::{LastHeard, PresenceRow, Session};
 use midshift_proto::access::local;

@@ -3,10 +3,11 @@
 use crate::world::{Otherwise, Result, Robot, World, clock, hello, serve, world, world_with};
 use midshift_core::fleet::REPORT_TOO_LONG;
 use midshift_core::ids::{PlaceId, RobotId, SiteId};
+use midshift_core::item::{Expect, Item};
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::robot::{HeldPlace, Lane, Mode, ReportedState};
-use midshift_core::rows::{Expect, Item, Log, Seq, Writer};
+use midshift_core::rows::{Log, Seq, Writer};
 use midshift_core::time::{Clock, Utc};
 use midshift_core::wall_clock::WallClock;
 use midshift_core::work::{DesiredWork, InboxItem, RobotEvent, Sample, SampleBody, Session};

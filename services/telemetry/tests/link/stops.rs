@@ -2,8 +2,9 @@
 
 use crate::world::{Result, Robot, World, world};
 use midshift_core::ids::{RobotId, StopId};
+use midshift_core::item::{Expect, Item};
 use midshift_core::robot::StopLevel;
-use midshift_core::rows::{Expect, Item, Revision, Writer};
+use midshift_core::rows::{Revision, Writer};
 use midshift_core::stop::record::StopRecord;
 use midshift_core::stop::{Reset, Scope, Stop};
 use midshift_core::time::Utc;

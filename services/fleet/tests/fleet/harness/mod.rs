@@ -15,7 +15,8 @@ pub use shaky::Shaky;
 use midshift_core::fleet::bugs::Bugs;
 use midshift_core::fleet::maps::MapChange;
 use midshift_core::ids::{RobotId, SiteId, TaskId};
-use midshift_core::rows::{Entry, Expect, Item, Record, Seq, Table, Writer};
+use midshift_core::item::{Expect, Item};
+use midshift_core::rows::{Entry, Record, Seq, Table, Writer};
 use midshift_core::site::{Site, text};
 use midshift_core::stop::record::StopRecord;
 use midshift_core::task::forms::Transport;
@@ -254,7 +255,7 @@ impl World {
     /// Telemetry states this about a machine with the robot's name.
     pub async fn told_by_telemetry(&self, id: &str, kind: &'static str, body: &str) {
         let mut item = Item::new(Writer::Telemetry, id);
-        item.facts.push(midshift_core::rows::Fact {
+        item.facts.push(midshift_core::item::Fact {
             log: midshift_core::rows::Log::Telemetry,
             subject: Arc::from(id),
             kind,
@@ -282,7 +283,7 @@ impl World {
             assert_eq!(known.event + 1, seq, "events arrive in order, none twice");
             let mut item = Item::new(Writer::Telemetry, id);
             item.update(&mark, revision, "lane.marked");
-            item.facts.push(midshift_core::rows::Fact {
+            item.facts.push(midshift_core::item::Fact {
                 log: midshift_core::rows::Log::RobotInbox,
                 subject: Arc::from(id),
                 kind: "robot.event",

@@ -5,12 +5,11 @@ use super::super::{Turn, audit};
 use crate::postgres_server::PostgresServer;
 use midshift_core::fleet::rows::FleetMark;
 use midshift_core::ids::{RobotId, SiteId, StopId};
+use midshift_core::item::{Expect, Fact, Item, RowChange, Write};
 use midshift_core::privacy::{self, Place, Retention};
 use midshift_core::robot::StopLevel;
 use midshift_core::rollout::rows::OtaMark;
-use midshift_core::rows::{
-    Expect, Fact, Index, Item, Key, Log, Record, Revision, RowChange, Seq, Table, Write, Writer,
-};
+use midshift_core::rows::{Index, Key, Log, Record, Revision, Seq, Table, Writer};
 use midshift_core::site::text;
 use midshift_core::stop::record::{StopRecord, copy};
 use midshift_core::stop::{Latch, Reset, Scope, Stop};

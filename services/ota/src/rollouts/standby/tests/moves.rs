@@ -1,7 +1,8 @@
 //! A client that watches a roll-out at one process and goes on at the other.
 
 use super::*;
-use midshift_core::rows::{Expect, Item, Writer};
+use midshift_core::item::{Expect, Item};
+use midshift_core::rows::Writer;
 use tokio_stream::StreamExt;
 
 /// The roll-out changes; its version then.
