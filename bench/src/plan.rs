@@ -5,15 +5,16 @@ use crate::figure::{Figure, percentile};
 use crate::old_store::{self, OldArgs};
 use midshift_core::fleet::projection::{FleetProjection, RevisedRow};
 use midshift_core::fleet::{Board, Pace, Plan, Slice, cycle, ensure_site_rows};
+use midshift_core::heartbeat::Live;
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::{Inventory, ReportedState, Vitals};
 use midshift_core::rows::{Record, Revision, Row};
+use midshift_core::session::Session;
 use midshift_core::site::route::Router;
 use midshift_core::site::{Site, grid, text};
 use midshift_core::task::forms::Transport;
 use midshift_core::task::{RawTask, TaskIntake, TaskState};
 use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
-use midshift_core::work::{Live, Session};
 use std::sync::Arc;
 use std::time::Instant;
 

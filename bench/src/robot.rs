@@ -6,7 +6,7 @@ use anyhow::{Context, bail};
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_core::ids::{RobotId, WaypointId};
 use midshift_core::robot::{Inventory, Lane, Mode, ReportedState, Vitals};
-use midshift_core::work::{InboxItem, RobotEvent, Sample, SampleBody};
+use midshift_core::robot_events::{InboxItem, RobotEvent, Sample, SampleBody};
 use midshift_proto::link::v1::link_service_client::LinkServiceClient;
 use midshift_proto::link::v1::{self, SessionRequest, SessionResponse};
 use midshift_proto::session::{Downlink, FromRobot, Heartbeat, Hello, LaneBatch, ToRobot, Uplink, Welcome};

@@ -4,8 +4,8 @@
 //! for waits the planner keeps a reserve. A test over seeded trips holds it.
 
 use crate::limits::STOP_SLOW_MM_S;
+use crate::step::StepKind;
 use crate::time::SiteDuration;
-use crate::work::StepKind;
 
 /// What the battery holds when full, milliwatt-hours.
 pub const CAPACITY_MWH: f64 = 1_200_000.0;

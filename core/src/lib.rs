@@ -6,10 +6,12 @@
 pub mod audit;
 pub mod authority;
 pub mod bugs;
+pub mod desired_state;
 pub mod energy;
 pub mod fleet;
 pub mod flood;
 pub mod gates;
+pub mod heartbeat;
 pub mod idempotency;
 pub mod identity;
 pub mod ids;
@@ -20,20 +22,23 @@ pub mod maintenance;
 pub mod nearest;
 pub mod overload;
 pub mod policy;
+pub mod presence;
 pub mod privacy;
 pub mod projection;
 pub mod reason;
 pub mod robot;
+pub mod robot_events;
 pub mod rollout;
 pub mod rows;
+pub mod session;
 pub mod site;
+pub mod step;
 pub mod stop;
 pub mod task;
 pub mod time;
 pub mod unknown_rows;
 pub mod update;
 pub mod wall_clock;
-pub mod work;
 
 use std::pin::Pin;
 

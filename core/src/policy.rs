@@ -123,7 +123,7 @@ impl SoftwareRules {
     }
 }
 
-/// Rules of one area, as an operator has them; robots get [`crate::work::AreaRules`] of them. A missing value means that this layer sets none, except for charging, which has defaults.
+/// Rules of one area, as an operator has them; robots get [`crate::desired_state::AreaRules`] of them. A missing value means that this layer sets none, except for charging, which has defaults.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AreaPolicy {
     /// Which area.

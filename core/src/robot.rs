@@ -1,36 +1,11 @@
 //! What is known of one robot: the report it sends each second, and the facts others derive from it.
 //!
-//! Four independent facts, each with one owner: presence (telemetry), mode (the robot), duty (fleet), software (OTA, later).
+//! Four independent facts, each with one owner: presence ([`crate::presence`], telemetry), mode (the robot), duty (fleet), software (OTA, later).
 
 use crate::ids::{AttemptId, PlaceId, StopId, TaskId, WaypointId};
-use crate::limits;
-use crate::time::LinkTime;
 use crate::update::UpdateReport;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-
-/// Whether a robot is heard, by the age of its newest heartbeat alone.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Presence {
-    /// A heartbeat within 3 s.
-    Online,
-    /// None for 3 s: no new work.
-    Suspect,
-    /// None for 31 s: its authority is over.
-    Offline,
-}
-
-impl Presence {
-    /// Of a robot whose newest heartbeat was processed at `heard`; none: nothing was heard of it.
-    pub fn since(heard: Option<LinkTime>, now: LinkTime) -> Self {
-        match heard.map(|at| now.since(at)) {
-            Some(age) if age <= limits::SUSPECT_AFTER => Self::Online,
-            Some(age) if age <= limits::OFFLINE_AFTER => Self::Suspect,
-            _ => Self::Offline,
-        }
-    }
-}
 
 /// Who drives. Decided by the robot. VDA 5050 words.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -380,23 +355,7 @@ pub struct Inventory {
     pub agent_version: String,
     /// Maker's model name.
     pub model: String,
-    /// It cannot feel what it carries: it knows that by its own memory, and forgets it by a person's word ([`crate::work::LoadWord`]).
+    /// It cannot feel what it carries: it knows that by its own memory, and forgets it by a person's word ([`crate::desired_state::LoadWord`]).
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub load_by_memory: bool,
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn presence_follows_the_age_of_the_newest_heartbeat() {
-        let now = LinkTime(100_000);
-        let at = |age_ms: u64| Presence::since(Some(LinkTime(100_000 - age_ms)), now);
-        assert_eq!(
-            [at(3_000), at(3_001), at(31_000), at(31_001)],
-            [Presence::Online, Presence::Suspect, Presence::Suspect, Presence::Offline]
-        );
-        assert_eq!(Presence::since(None, now), Presence::Offline);
-    }
 }

@@ -2,13 +2,14 @@
 //!
 //! Called by the agent (says [`FromRobot`], hears [`ToRobot`]) and by telemetry (the other way round).
 
+use midshift_core::desired_state::{DesiredPolicy, DesiredWork};
 use midshift_core::identity::SessionSecret;
 use midshift_core::ids::RobotId;
 use midshift_core::reason::Reason;
 use midshift_core::robot::{Inventory, Lane, ReportedState};
+use midshift_core::robot_events::InboxItem;
 use midshift_core::stop::{Reset, Stop};
 use midshift_core::update::DesiredUpdate;
-use midshift_core::work::{DesiredPolicy, DesiredWork, InboxItem};
 use std::collections::BTreeMap;
 
 /// The wire version that this build speaks.

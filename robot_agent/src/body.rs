@@ -7,8 +7,8 @@
 
 pub use midshift_core::ids::{TaskId, WaypointId};
 pub use midshift_core::robot::{Fault, HardwareStop, Inventory, Load, Mode, Pose, StopLevel};
+pub use midshift_core::step::StepKind;
 pub use midshift_core::time::{SiteDuration, SiteTime};
-pub use midshift_core::work::StepKind;
 
 /// What the maker allows, whatever anybody asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -7,8 +7,8 @@ use crate::faults::Injected;
 use midshift_agent::body::{Body, BodyLimits, BodyNews, BodyOrder, BodyState, Checked};
 use midshift_core::ids::{RobotId, TaskId, WaypointId};
 use midshift_core::robot::{Fault, HardwareStop, Inventory, Load, Mode, StopLevel};
+use midshift_core::step::StepKind;
 use midshift_core::time::SiteTime;
-use midshift_core::work::StepKind;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use tokio::sync::watch;
 

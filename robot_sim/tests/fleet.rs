@@ -3,8 +3,8 @@
 use midshift_agent::body::{Body, BodyOrder};
 use midshift_core::ids::RobotId;
 use midshift_core::site::{CORRIDOR, DEMO, Site, grid, text};
+use midshift_core::step::StepKind;
 use midshift_core::time::{Clock, Now, SiteTime, Utc};
-use midshift_core::work::StepKind;
 use midshift_proto::sim::v1;
 use midshift_proto::sim::v1::inject_fault_request::Fault;
 use midshift_proto::sim::v1::sim_service_server::SimService;

@@ -3,8 +3,8 @@
 use midshift_agent::body::{Body, BodyOrder, PathPoint};
 use midshift_core::ids::{PlaceId, RobotId, TaskId, WaypointId};
 use midshift_core::site::{CORRIDOR, Site, text};
+use midshift_core::step::StepKind;
 use midshift_core::time::{SiteDuration, SiteTime};
-use midshift_core::work::StepKind;
 use midshift_sim::behaviour::Behaviour;
 use midshift_sim::body::{BodyConfig, SimBody};
 use midshift_sim::faults::{FaultRates, Injected};

@@ -14,17 +14,20 @@ use midshift_core::fleet::rows::{Cordon, FleetMark, RobotControl, RobotCounter};
 use midshift_core::gates::TaskTally;
 use midshift_core::ids::{AttemptId, BundleId, RobotId, RolloutId, Subject, TaskId};
 use midshift_core::item::{Expect, Fact, Item};
-use midshift_core::robot::{Inventory, Lane, Presence};
+use midshift_core::presence::Presence;
+use midshift_core::presence::PresenceRow;
+use midshift_core::robot::{Inventory, Lane};
+use midshift_core::robot_events::{InboxEntry, InboxItem, WorkStats};
 use midshift_core::rollout::rows::{
     Act, Bundle, OtaMark, Phase as RolloutPhase, RobotSoftware, Rollout, RolloutRobot, Step,
 };
 use midshift_core::rollout::spec::RolloutSpec;
 use midshift_core::rows::{Log, Seq, Writer};
+use midshift_core::session::{LaneMark, Session};
 use midshift_core::task::forms::Transport;
 use midshift_core::task::state::RequestKey;
 use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskSpec, TaskState};
 use midshift_core::time::Utc;
-use midshift_core::work::{InboxEntry, InboxItem, LaneMark, PresenceRow, Session, WorkStats};
 use midshift_store::{Retention, Store};
 use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;

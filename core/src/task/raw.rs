@@ -6,8 +6,8 @@ use super::spec::{Retry, Selector, TaskSpec};
 use crate::ids::{RobotId, TaskId, WaypointId};
 use crate::limits;
 use crate::reason::{Refusal, Violations};
+use crate::step::{Effect, StepKind, WorkStep};
 use crate::time::Utc;
-use crate::work::{Effect, StepKind, WorkStep};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A task before any rule was checked. Absent means that the caller said nothing.

@@ -1,8 +1,8 @@
 //! A task that passed every rule. Built only by `raw::RawTask::check`; immutable once admitted.
 
 use crate::ids::{RobotId, TaskId};
+use crate::step::WorkStep;
 use crate::time::Utc;
-use crate::work::WorkStep;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -141,7 +141,7 @@ impl TaskSpec {
         self.steps
             .iter()
             .filter_map(|s| match &s.kind {
-                crate::work::StepKind::Action { name, .. } => Some(name.as_str()),
+                crate::step::StepKind::Action { name, .. } => Some(name.as_str()),
                 _ => None,
             })
             .collect()
@@ -153,7 +153,7 @@ impl TaskSpec {
     /// Goals of every goto at or after `step`, in order.
     pub fn goals(&self, step: usize) -> impl Iterator<Item = &crate::ids::WaypointId> {
         self.steps.iter().skip(step).filter_map(|s| match &s.kind {
-            crate::work::StepKind::Goto { waypoint } => Some(waypoint),
+            crate::step::StepKind::Goto { waypoint } => Some(waypoint),
             _ => None,
         })
     }

@@ -7,9 +7,9 @@ use crate::authority::Authority;
 use crate::ids::{AttemptId, PlaceId, RobotId, Subject, TaskId, WaypointId};
 use crate::reason::Reason;
 use crate::robot::Fault;
+use crate::robot_events::WorkStats;
 use crate::rows::{Index, Record, Table, body_is_json};
 use crate::time::Utc;
-use crate::work::WorkStats;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 

@@ -2,14 +2,17 @@
 
 use crate::{common, fleet, link, ota, stop, task, telemetry};
 use midshift_core::fleet::rows::{DrainState, HolderState};
-use midshift_core::robot::{Duty, FaultClass, HardwareStop, Lane, Mode, Presence, StopLevel};
+use midshift_core::presence::Presence;
+use midshift_core::robot::WorkState;
+use midshift_core::robot::{Duty, FaultClass, HardwareStop, Lane, Mode, StopLevel};
+use midshift_core::robot_events::PlaceNews;
 use midshift_core::rollout::rows::{Ending, Outcome, Pause, Phase as RolloutPhase, Step as RolloutStep};
 use midshift_core::rollout::spec::{AbortScope, SmallWave, SmallWaveFailure};
+use midshift_core::step::Effect;
 use midshift_core::stop::ladder::Stage;
 use midshift_core::task::state::Errand;
 use midshift_core::task::{AfterStopping, AttemptPhase, Phase, Resolution};
 use midshift_core::update::{Goal, UpdateState};
-use midshift_core::work::{Effect, PlaceNews, WorkState};
 
 /// A core enum with its twin on the wire.
 pub trait WireEnum: Sized {

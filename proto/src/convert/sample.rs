@@ -8,7 +8,7 @@ use midshift_core::ids::PlaceId;
 use midshift_core::limits;
 use midshift_core::reason::{Reason, Violations};
 use midshift_core::robot::Lane;
-use midshift_core::work::{AttemptReport, Gap, InboxItem, RobotEvent, Sample, SampleBody};
+use midshift_core::robot_events::{AttemptReport, Gap, InboxItem, RobotEvent, Sample, SampleBody};
 
 impl From<&AttemptReport> for v1::AttemptReport {
     fn from(report: &AttemptReport) -> Self {

@@ -8,12 +8,12 @@ use midshift_core::ids::{RequestId, RobotId, TaskId, WaypointId};
 use midshift_core::limits;
 use midshift_core::reason::{Refusal, Violations};
 use midshift_core::rows::Revision;
+use midshift_core::step::{Effect, StepKind, WorkStep};
 use midshift_core::task::forms::Transport;
 use midshift_core::task::raw::{RawRetry, RawStep, RawStepKind};
 use midshift_core::task::spec::{Retry, Selector};
 use midshift_core::task::{Attempt, Phase, RawTask, Resolution, TaskIntake, TaskSpec, TaskState};
 use midshift_core::time::Utc;
-use midshift_core::work::{Effect, StepKind, WorkStep};
 use prost::Message;
 use std::collections::{BTreeMap, BTreeSet};
 

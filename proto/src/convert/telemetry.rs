@@ -3,12 +3,16 @@
 use super::robot::lane_marks;
 use super::{WireEnum, timestamp};
 use crate::telemetry::v1;
+use midshift_core::heartbeat::Live;
 use midshift_core::ids::{AreaId, RobotId};
+use midshift_core::presence::Presence;
+use midshift_core::presence::{Condition, LastHeard, PresenceRow};
 use midshift_core::reason::{Code, Reason};
-use midshift_core::robot::{Lane, Presence};
+use midshift_core::robot::Lane;
+use midshift_core::robot_events::{InboxEntry, InboxItem};
+use midshift_core::session::Session;
 use midshift_core::time::{Now, Utc};
 use midshift_core::update::{Installed, InstalledSet};
-use midshift_core::work::{Condition, InboxEntry, InboxItem, LastHeard, Live, PresenceRow, Session};
 use std::collections::BTreeMap;
 
 /// What is known of one robot.

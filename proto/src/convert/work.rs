@@ -5,11 +5,12 @@ use super::{
     At, Parse, WireEnum, common, from_one, from_struct, id, list, maybe, maybe_id, need, permille, to_struct, word,
 };
 use crate::link::v1;
+use midshift_core::desired_state::{
+    AreaRules, Assignment, DesiredPolicy, DesiredWork, GrantedPlace, LoadWord, RoutePoint,
+};
 use midshift_core::ids::{AreaId, DrainId, PlaceId, RobotId, WaypointId};
 use midshift_core::reason::Violations;
-use midshift_core::work::{
-    AreaRules, Assignment, DesiredPolicy, DesiredWork, GrantedPlace, LoadWord, RoutePoint, StepKind, WorkStep,
-};
+use midshift_core::step::{StepKind, WorkStep};
 
 impl From<&WorkStep> for v1::WorkStep {
     fn from(step: &WorkStep) -> Self {

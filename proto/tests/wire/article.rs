@@ -1,7 +1,7 @@
 //! Both JSON forms of the source article, as they stand.
 
+use midshift_core::step::{Effect, StepKind};
 use midshift_core::task::TaskSpec;
-use midshift_core::work::{Effect, StepKind};
 use midshift_proto::convert::task::Submission;
 use midshift_proto::json::from_json;
 use midshift_proto::task::v1::SubmitTaskRequest;

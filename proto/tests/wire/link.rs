@@ -1,23 +1,27 @@
 //! The link there and back: what core says is what the other end hears.
 
 use midshift_core::authority::Authority;
+use midshift_core::desired_state::{
+    AreaRules, Assignment, DesiredPolicy, DesiredWork, GrantedPlace, LoadWord, RoutePoint,
+};
 use midshift_core::ids::{
     AreaId, AttemptId, BundleId, DrainId, PlaceId, RobotId, SetId, StopId, Subject, TaskId, WaypointId,
 };
 use midshift_core::limits;
 use midshift_core::policy::AreaPolicy;
 use midshift_core::reason::{Code, Reason};
+use midshift_core::robot::WorkState;
 use midshift_core::robot::{
     Fault, FaultClass, HardwareStop, HeldPlace, Inventory, Lane, Load, Mode, Pose, ReportedAttempt, ReportedState,
     StopLevel, Vitals,
 };
+use midshift_core::robot_events::{
+    AttemptReport, Gap, InboxItem, PlaceNews, RobotEvent, Sample, SampleBody, WorkStats,
+};
+use midshift_core::step::{Effect, StepKind, WorkStep};
 use midshift_core::stop::{Reset, Scope, Stop};
 use midshift_core::time::Utc;
 use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
-use midshift_core::work::{
-    AreaRules, Assignment, AttemptReport, DesiredPolicy, DesiredWork, Effect, Gap, GrantedPlace, InboxItem, LoadWord,
-    PlaceNews, RobotEvent, RoutePoint, Sample, SampleBody, StepKind, WorkState, WorkStats, WorkStep,
-};
 use midshift_proto::link::v1;
 use midshift_proto::parse;
 use midshift_proto::session::{

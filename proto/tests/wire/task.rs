@@ -41,7 +41,7 @@ fn a_spec_comes_back_as_it_was_understood() {
     assert_eq!(again, spec);
     assert_eq!(
         (spec.steps[2].effect, spec.steps[1].timeout_ms, spec.not_before),
-        (midshift_core::work::Effect::Repeatable, Some(30_000), Some(Utc(1_780_300_800_000)))
+        (midshift_core::step::Effect::Repeatable, Some(30_000), Some(Utc(1_780_300_800_000)))
     );
 }
 

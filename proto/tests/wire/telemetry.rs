@@ -1,11 +1,15 @@
 //! Robots and their events as callers see them.
 
+use midshift_core::heartbeat::{ClockOffset, Live};
 use midshift_core::ids::{RobotId, SetId};
+use midshift_core::presence::Presence;
+use midshift_core::presence::PresenceRow;
 use midshift_core::reason::Code;
-use midshift_core::robot::{Inventory, Lane, Mode, Presence, ReportedState};
+use midshift_core::robot::{Inventory, Lane, Mode, ReportedState};
+use midshift_core::robot_events::{Gap, InboxEntry, InboxItem};
+use midshift_core::session::Session;
 use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
 use midshift_core::update::{Installed, InstalledSet};
-use midshift_core::work::{ClockOffset, Gap, InboxEntry, InboxItem, Live, PresenceRow, Session};
 use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot};
 use midshift_proto::convert::{ms_of, time_of};
 use midshift_proto::{link, telemetry::v1};

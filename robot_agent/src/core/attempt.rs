@@ -9,9 +9,11 @@ use super::work::{CHARGE, Doing, Ending, PARK, Pause, Work};
 use crate::body::{BodyNews, BodyOrder, Checked};
 use crate::storage::{Intent, Op};
 use midshift_core::ids::WaypointId;
+use midshift_core::robot::WorkState;
 use midshift_core::robot::{FAULT_TIMEOUT, Fault, FaultClass, HardwareStop, Lane, Mode, ReportedAttempt, StopLevel};
+use midshift_core::robot_events::{AttemptReport, RobotEvent, WorkStats};
+use midshift_core::step::{Effect, StepKind, WorkStep};
 use midshift_core::time::{LinkTime, Now, SiteDuration, SiteTime};
-use midshift_core::work::{AttemptReport, Effect, RobotEvent, StepKind, WorkState, WorkStats, WorkStep};
 use std::sync::Arc;
 
 /// Charging ends here if neither the action nor the area says, permille.

@@ -8,10 +8,12 @@ use super::places::{Entry, Places, needs};
 use super::state::AgentCore;
 use super::work::{Doing, Pause, Work};
 use crate::body::{BodyOrder, PathPoint};
+use midshift_core::desired_state::{Assignment, RoutePoint};
 use midshift_core::ids::WaypointId;
 use midshift_core::robot::{Lane, Pose, StopLevel};
+use midshift_core::robot_events::RobotEvent;
+use midshift_core::step::StepKind;
 use midshift_core::time::{LinkDuration, Now};
-use midshift_core::work::{Assignment, RobotEvent, RoutePoint, StepKind};
 
 /// How far from a waypoint or lane a robot may be and still count as on it, millimetres.
 const NEAR_MM: f64 = 200.0;

@@ -5,10 +5,10 @@
 //! core for every path, and again when a policy changes.
 
 use crate::body::BodyLimits;
+use midshift_core::desired_state::{AreaRules, RoutePoint};
 use midshift_core::ids::AreaId;
 use midshift_core::limits;
 use midshift_core::robot::StopLevel;
-use midshift_core::work::{AreaRules, RoutePoint};
 
 /// Speed on the way to `point`, millimetres per second: the lowest of maker, area, lane, task and stop, but never below
 /// the floor of the body, which must be able to clear a lane.

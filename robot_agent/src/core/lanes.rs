@@ -11,7 +11,7 @@
 use crate::storage::ring::{Item, Ring};
 use midshift_core::limits;
 use midshift_core::robot::Lane;
-use midshift_core::work::{InboxItem, Sample};
+use midshift_core::robot_events::{InboxItem, Sample};
 use midshift_proto::session::LaneBatch;
 
 /// Unacknowledged samples of CRITICAL or EVENT under way at most. They need no credit; the queue to the wire needs a

@@ -6,13 +6,14 @@ use super::state::AgentCore;
 use super::work::{CHARGE, Ending, PARK, Work};
 use crate::storage::{Holder, Op};
 use midshift_core::authority::Authority;
+use midshift_core::desired_state::{Assignment, DesiredWork, LoadWord};
 use midshift_core::ids::DrainId;
 use midshift_core::reason::{Code, Reason};
+use midshift_core::robot::WorkState;
 use midshift_core::robot::{Lane, Mode, StopLevel};
+use midshift_core::robot_events::{AttemptReport, RobotEvent, UNREADABLE_WORK, WorkStats};
+use midshift_core::step::StepKind;
 use midshift_core::time::Now;
-use midshift_core::work::{
-    Assignment, AttemptReport, DesiredWork, LoadWord, RobotEvent, StepKind, UNREADABLE_WORK, WorkState, WorkStats,
-};
 use std::sync::Arc;
 
 /// Refused attempts remembered beside the ledger, so that a repeat of the same desired state is not answered twice.

@@ -7,10 +7,11 @@
 
 use crate::storage::PlacesRow;
 use midshift_core::authority::{Authority, SentHeartbeats, Stale};
+use midshift_core::desired_state::{GrantedPlace, RoutePoint};
 use midshift_core::ids::PlaceId;
 use midshift_core::robot::HeldPlace;
+use midshift_core::robot_events::{PlaceNews, RobotEvent};
 use midshift_core::time::{LinkDuration, LinkTime};
-use midshift_core::work::{GrantedPlace, PlaceNews, RobotEvent, RoutePoint};
 
 /// Whether a place may be entered now.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -14,11 +14,12 @@ use crate::storage::{Op, RobotMemory};
 use crate::transport::replay::Pace;
 use crate::update::Updater;
 use midshift_core::authority::SentHeartbeats;
+use midshift_core::desired_state::DesiredWork;
 use midshift_core::ids::{AttemptId, RobotId, WaypointId};
 use midshift_core::limits;
 use midshift_core::robot::{Fault, HardwareStop, Inventory, Lane, Mode};
+use midshift_core::robot_events::RobotEvent;
 use midshift_core::time::{LinkDuration, LinkTime, Now, SiteDuration, SiteTime};
-use midshift_core::work::{DesiredWork, RobotEvent};
 use midshift_proto::session::ClockSample;
 use std::collections::{BTreeSet, VecDeque};
 

@@ -12,11 +12,12 @@ use crate::stop::StopNews;
 use crate::storage::{Applied, Op, SessionMemory};
 use crate::transport::replay::{Pace, Replayed};
 use midshift_core::authority::SentHeartbeats;
+use midshift_core::desired_state::DesiredPolicy;
 use midshift_core::ids::PlaceId;
 use midshift_core::limits;
 use midshift_core::robot::{Fault, FaultClass, Lane, ReportedState, StopLevel, Vitals};
+use midshift_core::robot_events::{RobotEvent, SampleBody};
 use midshift_core::time::{LinkDuration, Now, SiteDuration, Utc};
-use midshift_core::work::{DesiredPolicy, RobotEvent, SampleBody};
 use midshift_proto::session::{ClockSample, Downlink, Heartbeat, LaneAck, LaneBatch, StatusReplay, Uplink, Welcome};
 
 /// Above the critical threshold by this much the battery may become critical again, permille.

@@ -11,12 +11,13 @@ use super::work::{Doing, Work};
 use crate::body::BodyOrder;
 use crate::stop::storage::Loaded;
 use crate::stop::{Floor, StopNews, StopOrder, StopState};
+use midshift_core::desired_state::DesiredWork;
 use midshift_core::ids::{AreaId, StopId};
 use midshift_core::robot::{Lane, StopLevel};
+use midshift_core::robot_events::RobotEvent;
 use midshift_core::stop::Reset;
 use midshift_core::stop::ladder::Around;
 use midshift_core::time::{LinkTime, Now, SiteDuration, SiteTime};
-use midshift_core::work::{DesiredWork, RobotEvent};
 use midshift_proto::session::{Downlink, StopFacts};
 
 /// A robot that drives while a part of the site is stopped looks this often where it is: 150 mm at its fastest.

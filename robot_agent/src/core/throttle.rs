@@ -6,8 +6,8 @@
 
 use midshift_core::limits;
 use midshift_core::robot::Lane;
+use midshift_core::robot_events::RobotEvent;
 use midshift_core::time::{LinkDuration, LinkTime};
-use midshift_core::work::RobotEvent;
 use std::collections::VecDeque;
 
 /// An event that waits for its turn.
@@ -102,7 +102,7 @@ mod tests {
     use super::*;
     use midshift_core::ids::PlaceId;
     use midshift_core::robot::{Fault, FaultClass};
-    use midshift_core::work::PlaceNews;
+    use midshift_core::robot_events::PlaceNews;
 
     fn fault(cleared: bool) -> RobotEvent {
         RobotEvent::Fault { fault: Fault { code: 7, class: FaultClass::Mechanical, message: "arm".into() }, cleared }

@@ -4,8 +4,10 @@
 
 use crate::body::PathPoint;
 use crate::storage::Holder;
+use midshift_core::desired_state::Assignment;
 use midshift_core::robot::Fault;
-use midshift_core::work::{Assignment, StepKind, WorkState, WorkStep};
+use midshift_core::robot::WorkState;
+use midshift_core::step::{StepKind, WorkStep};
 use std::sync::Arc;
 
 /// Actions that the agent does by itself.

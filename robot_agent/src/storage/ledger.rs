@@ -10,10 +10,12 @@ use super::proven::Proven;
 pub use super::rows::{Applied, Holder, Intent, PlacesRow, SessionMemory, SubjectRow};
 use super::software::SoftwareRow;
 use midshift_bundle::trust::Trusted;
+use midshift_core::desired_state::AreaRules;
 use midshift_core::ids::{AttemptId, DrainId, Subject};
 use midshift_core::limits;
 use midshift_core::robot::ReportedAttempt;
-use midshift_core::work::{AreaRules, AttemptReport, WorkState};
+use midshift_core::robot::WorkState;
+use midshift_core::robot_events::AttemptReport;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 

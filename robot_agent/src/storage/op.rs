@@ -5,9 +5,10 @@ use super::proven::Proven;
 use super::rows::{Applied, Holder, PlacesRow, SessionMemory};
 use super::software::SoftwareRow;
 use midshift_bundle::trust::Trusted;
+use midshift_core::desired_state::AreaRules;
 use midshift_core::ids::{AttemptId, DrainId, Subject};
 use midshift_core::robot::{Lane, ReportedAttempt};
-use midshift_core::work::{AreaRules, AttemptReport, Gap, Sample};
+use midshift_core::robot_events::{AttemptReport, Gap, Sample};
 use std::sync::Arc;
 
 /// One change of what a robot remembers.

@@ -9,7 +9,7 @@ use super::op::Op;
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::robot::Lane;
-use midshift_core::work::{Gap, Sample, SampleBody};
+use midshift_core::robot_events::{Gap, Sample, SampleBody};
 use std::collections::VecDeque;
 use std::sync::Arc;
 

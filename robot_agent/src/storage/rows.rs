@@ -4,7 +4,8 @@
 
 use midshift_core::identity::SessionSecret;
 use midshift_core::ids::{AttemptId, PlaceId};
-use midshift_core::work::{AttemptReport, StepKind};
+use midshift_core::robot_events::AttemptReport;
+use midshift_core::step::StepKind;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;

@@ -15,7 +15,7 @@ use midshift_core::Boxed;
 use midshift_core::ids::Subject;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{Lane, ReportedAttempt};
-use midshift_core::work::{Gap, Sample};
+use midshift_core::robot_events::{Gap, Sample};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use sqlx::sqlite::{SqliteArguments, SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};

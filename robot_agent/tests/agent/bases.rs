@@ -7,9 +7,9 @@ use midshift_agent::update::Job;
 use midshift_bundle::manifest::{ComponentKind, Migration};
 use midshift_core::limits;
 use midshift_core::reason::Code;
+use midshift_core::robot_events::RobotEvent;
 use midshift_core::time::Utc;
 use midshift_core::update::{Goal, UpdateEvent, UpdateState};
-use midshift_core::work::RobotEvent;
 
 // --- migrations
 

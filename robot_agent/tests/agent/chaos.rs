@@ -7,12 +7,13 @@ use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_agent::core::Input;
 use midshift_agent::memory::MemoryStore;
 use midshift_core::authority::SentHeartbeats;
+use midshift_core::desired_state::{Assignment, DesiredWork, GrantedPlace, RoutePoint};
 use midshift_core::ids::AttemptId;
 use midshift_core::robot::Lane;
+use midshift_core::robot::WorkState;
+use midshift_core::robot_events::{PlaceNews, RobotEvent};
+use midshift_core::step::{Effect, StepKind, WorkStep};
 use midshift_core::time::LinkTime;
-use midshift_core::work::{
-    Assignment, DesiredWork, Effect, GrantedPlace, PlaceNews, RobotEvent, RoutePoint, StepKind, WorkState, WorkStep,
-};
 use proptest::prelude::{Just, ProptestConfig, Strategy, any, prop_oneof, proptest};
 use proptest::test_runner::{RngAlgorithm, TestRng, TestRunner};
 use std::collections::{BTreeMap, BTreeSet};

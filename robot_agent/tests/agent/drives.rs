@@ -5,11 +5,12 @@ use crate::test_body::TestBody;
 use midshift_agent::body::BodyNews;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_agent::memory::MemoryStore;
+use midshift_core::desired_state::{AreaRules, Assignment, DesiredPolicy, DesiredWork, GrantedPlace, RoutePoint};
 use midshift_core::ids::{AreaId, RobotId};
 use midshift_core::policy::AreaPolicy;
+use midshift_core::robot::WorkState;
 use midshift_core::robot::{HardwareStop, Mode};
-use midshift_core::work::PlaceNews::{Entered, Left, NotEntered};
-use midshift_core::work::{AreaRules, Assignment, DesiredPolicy, DesiredWork, GrantedPlace, RoutePoint, WorkState};
+use midshift_core::robot_events::PlaceNews::{Entered, Left, NotEntered};
 use midshift_proto::session::Downlink;
 
 /// A, then B; a door on the way to C and on to D, where one stands; E is the goal.

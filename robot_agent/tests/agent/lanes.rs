@@ -10,8 +10,9 @@ use midshift_agent::store::{Op, RobotMemory, Store};
 use midshift_core::ids::AttemptId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
+use midshift_core::robot::WorkState;
 use midshift_core::robot::{Lane, Mode, ReportedAttempt, Vitals};
-use midshift_core::work::{AttemptReport, Gap, InboxItem, RobotEvent, SampleBody, WorkState, WorkStats};
+use midshift_core::robot_events::{AttemptReport, Gap, InboxItem, RobotEvent, SampleBody, WorkStats};
 use midshift_proto::session::{Downlink, LaneAck};
 use std::sync::Arc;
 

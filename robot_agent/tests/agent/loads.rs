@@ -5,8 +5,9 @@ use crate::test_body::TestBody;
 use midshift_agent::body::BodyNews;
 use midshift_agent::bugs::Bugs;
 use midshift_agent::memory::MemoryStore;
+use midshift_core::desired_state::{DesiredWork, LoadWord};
 use midshift_core::robot::Load;
-use midshift_core::work::{DesiredWork, LoadWord, RobotEvent};
+use midshift_core::robot_events::RobotEvent;
 
 /// A robot that is heard and carries a box, by memory alone or not.
 fn carrying(load_by_memory: bool) -> Rig {

@@ -6,8 +6,11 @@ use midshift_agent::body::BodyNews;
 use midshift_agent::bugs::{Bugs, SeededBug};
 use midshift_agent::core::{ExitReason, Input};
 use midshift_agent::memory::MemoryStore;
+use midshift_core::desired_state::{Assignment, DesiredWork};
+use midshift_core::robot::WorkState;
 use midshift_core::robot::{Fault, FaultClass, Mode};
-use midshift_core::work::{Assignment, DesiredWork, Effect, RobotEvent, WorkState};
+use midshift_core::robot_events::RobotEvent;
+use midshift_core::step::Effect;
 use midshift_proto::link::v1;
 use midshift_proto::session::{ClockSample, Downlink, Echo, ToRobot, Welcome};
 
@@ -191,11 +194,11 @@ fn desired_work_never_moves_backwards_unless_the_store_is_another() {
     let mut rig = Rig::at("A");
     rig.connect();
     rig.work(rig.desired(None));
-    let old = midshift_core::work::DesiredWork { generation: 3, ..rig.desired(Some(drive(&rig, "T1", 1))) };
+    let old = midshift_core::desired_state::DesiredWork { generation: 3, ..rig.desired(Some(drive(&rig, "T1", 1))) };
     rig.down(Downlink { work: Some(old.clone()), ..Downlink::default() });
     assert_eq!(rig.states(), []);
     rig.connect_as(Welcome { session_epoch: 7, store_id: "store-2".into(), ..welcome() });
-    let old = midshift_core::work::DesiredWork { assignment: Some(drive(&rig, "T1", 1)), ..old };
+    let old = midshift_core::desired_state::DesiredWork { assignment: Some(drive(&rig, "T1", 1)), ..old };
     rig.down(Downlink { work: Some(old), ..Downlink::default() });
     assert_eq!(rig.states().first(), Some(&(WorkState::Accepted, 0)));
 }

@@ -7,7 +7,7 @@ use midshift_agent::replay::Replayed;
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::robot::{Lane, Mode};
-use midshift_core::work::InboxItem;
+use midshift_core::robot_events::InboxItem;
 use midshift_proto::session::{Downlink, LaneAck, LaneBatch, Welcome};
 
 fn numbers(items: &[InboxItem]) -> Vec<u64> {

@@ -2,7 +2,8 @@
 
 use crate::rig::{Rig, action, attempt};
 use midshift_agent::body::Checked;
-use midshift_core::work::{Effect, WorkState};
+use midshift_core::robot::WorkState;
+use midshift_core::step::Effect;
 
 /// Inside `effect`, killed, and told again what it has to do.
 fn killed_inside(effect: Effect, checked: Checked) -> Rig {
@@ -46,7 +47,7 @@ fn a_step_that_was_done_before_the_kill_is_not_done_again() {
     assert_eq!(rig.states().last(), Some(&(WorkState::Executing, 1)));
     assert_eq!(rig.body.log().acts, 2);
     assert!(
-        matches!(&rig.body.log().acting, Some(midshift_core::work::StepKind::Action { name, .. }) if name == "place")
+        matches!(&rig.body.log().acting, Some(midshift_core::step::StepKind::Action { name, .. }) if name == "place")
     );
 }
 

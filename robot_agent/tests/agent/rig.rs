@@ -14,15 +14,15 @@ use midshift_agent::stop::{CheckIn, StopNews};
 use midshift_agent::update::io::{UpdateWorker, Worker};
 use midshift_agent::update::{Done, Failure, Job};
 use midshift_core::authority::Authority;
+use midshift_core::desired_state::{Assignment, DesiredWork, GrantedPlace, RoutePoint};
 use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId, WaypointId};
+use midshift_core::robot::WorkState;
 use midshift_core::robot::{Lane, ReportedState};
+use midshift_core::robot_events::{AttemptReport, InboxItem, PlaceNews, RobotEvent, SampleBody};
+use midshift_core::step::{Effect, StepKind, WorkStep};
 use midshift_core::stop::robot::SavedStops;
 use midshift_core::time::{LinkTime, Now, SiteTime, Utc};
 use midshift_core::update::UpdateState;
-use midshift_core::work::{
-    Assignment, AttemptReport, DesiredWork, Effect, GrantedPlace, InboxItem, PlaceNews, RobotEvent, RoutePoint,
-    SampleBody, StepKind, WorkState, WorkStep,
-};
 use midshift_proto::session::{ClockSample, Downlink, Echo, LaneAck, LaneBatch, StatusReplay, Uplink, Welcome};
 use std::sync::Arc;
 use tokio_util::sync::CancellationToken;

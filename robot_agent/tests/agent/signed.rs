@@ -16,8 +16,8 @@ use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::Migration;
 use midshift_core::reason::Code;
 use midshift_core::robot::FAULT_SOFTWARE;
+use midshift_core::step::Effect;
 use midshift_core::update::{Goal, UpdateState};
-use midshift_core::work::Effect;
 use std::collections::BTreeSet;
 
 const DAY_MS: u64 = 24 * 3_600_000;

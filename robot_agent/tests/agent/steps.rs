@@ -3,8 +3,11 @@
 use crate::rig::{Rig, action, goto, point, step};
 use midshift_agent::body::{BodyNews, Checked};
 use midshift_agent::core::Input;
+use midshift_core::desired_state::{Assignment, DesiredWork};
+use midshift_core::robot::WorkState;
 use midshift_core::robot::{FAULT_TIMEOUT, Fault, FaultClass, Load};
-use midshift_core::work::{Assignment, DesiredWork, Effect, RobotEvent, StepKind, WorkState, WorkStep};
+use midshift_core::robot_events::RobotEvent;
+use midshift_core::step::{Effect, StepKind, WorkStep};
 
 fn fault(code: u32) -> Fault {
     Fault { code, class: FaultClass::Recoverable, message: String::new() }

@@ -4,8 +4,8 @@
 use crate::rig::{Rig, goto, point};
 use crate::stops::{attend, free, hear_news, moves, reset, serve, stop, stop_id, told};
 use midshift_agent::stop::StopNews;
+use midshift_core::desired_state::{Assignment, DesiredWork};
 use midshift_core::robot::StopLevel;
-use midshift_core::work::{Assignment, DesiredWork};
 use proptest::prelude::*;
 use proptest::test_runner::{RngAlgorithm, TestRng, TestRunner};
 use std::cell::Cell;

@@ -6,10 +6,10 @@ use crate::stops::{
 };
 use midshift_agent::core::Input;
 use midshift_agent::stop::StopNews;
+use midshift_core::desired_state::{AreaRules, DesiredPolicy};
 use midshift_core::ids::{AreaId, RobotId, StopId};
 use midshift_core::policy::AreaPolicy;
 use midshift_core::robot::StopLevel;
-use midshift_core::work::{AreaRules, DesiredPolicy};
 use midshift_proto::session::Downlink;
 
 #[test]

@@ -7,9 +7,11 @@ use crate::stops::{attend, desk, freed, reset, serve, stop, stop_id, told};
 use crate::updates::{
     Order, activate, drain, maintain, name_of, on_trial, relaunch, report, stage, state, switch, want,
 };
+use midshift_core::desired_state::DesiredWork;
 use midshift_core::robot::StopLevel;
+use midshift_core::robot_events::RobotEvent;
+use midshift_core::step::Effect;
 use midshift_core::update::{Goal, UpdateEvent, UpdateState};
-use midshift_core::work::{DesiredWork, Effect, RobotEvent};
 
 fn staged() -> (Rig, Order, Releases) {
     let releases = Releases::new();

@@ -4,12 +4,15 @@
 use crate::rig::{Rig, StopDesk, action, goto, point};
 use midshift_agent::core::Input;
 use midshift_agent::stop::{CheckIn, StopNews};
+use midshift_core::desired_state::{Assignment, DesiredWork};
 use midshift_core::ids::{AreaId, RobotId, StopId};
+use midshift_core::robot::WorkState;
 use midshift_core::robot::{Load, Pose, StopLevel};
+use midshift_core::robot_events::RobotEvent;
+use midshift_core::step::{Effect, WorkStep};
 use midshift_core::stop::ladder::Stage;
 use midshift_core::stop::{Region, Reset, Scope, Stop};
 use midshift_core::time::Utc;
-use midshift_core::work::{Assignment, DesiredWork, Effect, RobotEvent, WorkState, WorkStep};
 use midshift_proto::session::Downlink;
 use std::collections::BTreeSet;
 

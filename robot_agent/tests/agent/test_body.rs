@@ -4,8 +4,8 @@ use crate::rig::{waypoint, x_of};
 use midshift_agent::body::{Body, BodyLimits, BodyNews, BodyOrder, BodyState, Checked, PathPoint};
 use midshift_core::ids::{TaskId, WaypointId};
 use midshift_core::robot::{Fault, HardwareStop, Inventory, Load, Mode, Pose, StopLevel};
+use midshift_core::step::StepKind;
 use midshift_core::time::SiteTime;
-use midshift_core::work::StepKind;
 use std::sync::{Arc, Mutex, MutexGuard};
 
 /// What the body was told and how it is.

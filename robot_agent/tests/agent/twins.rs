@@ -6,9 +6,10 @@ use crate::rig::{Rig, goto, point};
 use crate::stops::{freed, moves, serve, stop, told};
 use crate::updates::{Order, state, want};
 use midshift_agent::bugs::{Bugs, SeededBug};
+use midshift_core::desired_state::{Assignment, RoutePoint};
 use midshift_core::robot::StopLevel;
+use midshift_core::robot_events::UNREADABLE_WORK;
 use midshift_core::update::{Goal, UpdateState};
-use midshift_core::work::{Assignment, RoutePoint, UNREADABLE_WORK};
 use midshift_proto::session::Downlink;
 
 fn rig(bugs: &[SeededBug]) -> (Rig, Releases) {

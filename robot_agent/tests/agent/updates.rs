@@ -12,8 +12,9 @@ use midshift_bundle::manifest::SafetyClass;
 use midshift_core::ids::DrainId;
 use midshift_core::reason::Code;
 use midshift_core::robot::{Fault, FaultClass, HardwareStop, Load, Mode};
+use midshift_core::robot_events::RobotEvent;
+use midshift_core::step::Effect;
 use midshift_core::update::{ActivationGrant, DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
-use midshift_core::work::{Effect, RobotEvent};
 use midshift_proto::session::Downlink;
 
 /// Milliseconds of site time on probation.
@@ -381,7 +382,8 @@ fn a_robot_in_a_passage_does_not_change_its_software() {
     let mut order = stage(&mut rig, &releases, &bundle, 1);
     let mut work = rig.desired(None);
     work.maintenance = Some(drain("drain-1"));
-    work.grants = vec![midshift_core::work::GrantedPlace { place_id: place_id("P1"), grant_id: 5, entry: None }];
+    work.grants =
+        vec![midshift_core::desired_state::GrantedPlace { place_id: place_id("P1"), grant_id: 5, entry: None }];
     order.drain_id = work.maintenance.clone();
     let mut places = rig.store.memory().expect("loaded").ledger.places;
     places.inside.insert(place_id("P1"), 5);

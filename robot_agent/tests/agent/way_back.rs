@@ -12,8 +12,8 @@ use midshift_agent::core::ExitReason;
 use midshift_bundle::manifest::Migration;
 use midshift_core::reason::Code;
 use midshift_core::robot::HardwareStop;
+use midshift_core::step::Effect;
 use midshift_core::update::{Goal, UpdateState};
-use midshift_core::work::Effect;
 
 #[test]
 fn what_the_launcher_put_away_is_told_and_not_tried_again() {

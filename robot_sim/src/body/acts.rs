@@ -7,8 +7,8 @@ use crate::world::{UNNAMED_SKU, lock, sku_of};
 use midshift_agent::body::BodyNews;
 use midshift_core::energy::{ACTION_VARIES_PERMILLE, HANDLE, INSPECT};
 use midshift_core::robot::{Fault, Load};
+use midshift_core::step::StepKind;
 use midshift_core::time::{SiteDuration, SiteTime};
-use midshift_core::work::StepKind;
 use rand::RngExt;
 
 impl SimBody {

@@ -7,8 +7,8 @@ use crate::world::lock;
 use midshift_agent::body::{Body, BodyLimits, BodyNews, BodyOrder, BodyState, Checked, PathPoint};
 use midshift_core::ids::{TaskId, WaypointId};
 use midshift_core::robot::{Fault, HardwareStop, Inventory, Load, Mode, Pose, StopLevel};
+use midshift_core::step::StepKind;
 use midshift_core::time::{SiteDuration, SiteTime};
-use midshift_core::work::StepKind;
 use std::collections::{BTreeMap, VecDeque};
 
 /// A body with a file writes where it is this often while it moves, so that a killed process does not move it back far.

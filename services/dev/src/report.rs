@@ -2,10 +2,10 @@
 
 use crate::scenario::Story;
 use crate::task_summary::Tasks;
+use midshift_core::heartbeat::Live;
 use midshift_core::ids::TaskId;
 use midshift_core::task::Phase;
 use midshift_core::time::Clock;
-use midshift_core::work::Live;
 use midshift_sim::fleet::FleetReport;
 use midshift_store::LiveBoard;
 use serde::Serialize;

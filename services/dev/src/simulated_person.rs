@@ -2,9 +2,9 @@
 //!
 //! Invariant: only silences are resumed, each by its name. A fleet stop stays with whoever resets and resumes it. Called by `dev`.
 
+use midshift_core::heartbeat::Live;
 use midshift_core::ids::StopId;
 use midshift_core::stop::robot::is_silence;
-use midshift_core::work::Live;
 use midshift_proto::task::v1::ResumeHeldRequest;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use midshift_store::LiveBoard;

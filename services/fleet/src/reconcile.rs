@@ -11,6 +11,7 @@ use midshift_core::fleet::projection::{self, FleetProjection};
 use midshift_core::fleet::{
     Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, ensure_site_rows, explain, maps, objects,
 };
+use midshift_core::heartbeat::Live;
 use midshift_core::idempotency;
 use midshift_core::identity::Actor;
 use midshift_core::leadership::{FleetLeader, LeaderLease, LeaseAction, OwnEntries};
@@ -19,7 +20,6 @@ use midshift_core::projection::entries_of;
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Key, Log, Seq, Table};
 use midshift_core::time::Now;
-use midshift_core::work::Live;
 use midshift_store::{Dirty, Error, FeedPage, Store, leadership};
 use std::ops::Range;
 use std::sync::OnceLock;

@@ -14,7 +14,7 @@ use axum::routing::get;
 use http::StatusCode;
 use midshift_cli::roles::Role;
 use midshift_cli::site_answer::SiteAnswer;
-use midshift_core::work::Live;
+use midshift_core::heartbeat::Live;
 use midshift_core::{Boxed, limits};
 use midshift_edge::{Denials, Listen, Listener};
 use midshift_fleet::{FleetService, Reconciler};

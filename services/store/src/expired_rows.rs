@@ -7,10 +7,10 @@ use midshift_core::Boxed;
 use midshift_core::fleet::rows::{RobotAuthority, RobotControl, RobotHolder};
 use midshift_core::item::{Expect, Item, Write};
 use midshift_core::limits;
-use midshift_core::robot::Presence;
+use midshift_core::presence::Presence;
+use midshift_core::presence::PresenceRow;
 use midshift_core::rows::{Key, Row, Table, Writer};
 use midshift_core::time::Utc;
-use midshift_core::work::PresenceRow;
 use std::sync::Arc;
 
 /// Rows of one item.

@@ -9,10 +9,10 @@
 use crate::{Error, LiveBoard, Store};
 use async_trait::async_trait;
 use midshift_core::Boxed;
+use midshift_core::heartbeat::{Live, SharedHeartbeat};
 use midshift_core::ids::RobotId;
 use midshift_core::rows::Seq;
 use midshift_core::time::Clock;
-use midshift_core::work::{Live, SharedHeartbeat};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;

@@ -49,8 +49,8 @@ impl SkippedRows {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use midshift_core::presence::PresenceRow;
     use midshift_core::rows::{Index, Revision};
-    use midshift_core::work::PresenceRow;
 
     #[test]
     fn a_value_of_a_newer_version_is_left_out_until_it_can_be_read_and_damage_is_an_error() {

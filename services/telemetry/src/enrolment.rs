@@ -13,7 +13,7 @@ use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::rollout::rows::RobotSoftware;
-use midshift_core::work::Session;
+use midshift_core::session::Session;
 use midshift_store::{Error, load};
 use std::sync::Arc;
 use std::time::Duration;

@@ -9,9 +9,10 @@ use crate::inner::Inner;
 use midshift_core::ids::RobotId;
 use midshift_core::item::{Expect, Fact, Item};
 use midshift_core::robot::Lane;
+use midshift_core::robot_events::{InboxEntry, InboxItem};
 use midshift_core::rows::{Log, Revision, Writer};
+use midshift_core::session::LaneMark;
 use midshift_core::time::Utc;
-use midshift_core::work::{InboxEntry, InboxItem, LaneMark};
 use midshift_proto::session::{LaneAck, LaneBatch};
 use midshift_store::{CommitError, load};
 use std::collections::VecDeque;
@@ -206,7 +207,7 @@ mod tests {
     use super::*;
     use midshift_core::reason::Code;
     use midshift_core::robot::Mode;
-    use midshift_core::work::{Gap, RobotEvent, Sample, SampleBody};
+    use midshift_core::robot_events::{Gap, RobotEvent, Sample, SampleBody};
 
     fn robot() -> RobotId {
         RobotId::parse("r1").expect("a valid id")

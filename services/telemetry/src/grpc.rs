@@ -2,14 +2,17 @@
 
 use crate::TelemetryService;
 use crate::inner::Inner;
+use midshift_core::heartbeat::Live;
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
+use midshift_core::presence::Presence;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
-use midshift_core::robot::{Lane, Presence};
+use midshift_core::robot::Lane;
+use midshift_core::robot_events::{InboxEntry, InboxItem, RobotEvent, SampleBody};
 use midshift_core::rows::{Log, Seq};
+use midshift_core::session::Session;
 use midshift_core::time::Utc;
-use midshift_core::work::{InboxEntry, InboxItem, Live, RobotEvent, SampleBody, Session};
 use midshift_proto::access::caller;
 use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot, shown_presence};

@@ -2,7 +2,7 @@
 //!
 //! Only shown, and used to flag stamps from the future; nothing is ordered by it.
 
-use midshift_core::work::ClockOffset;
+use midshift_core::heartbeat::ClockOffset;
 use midshift_proto::session::ClockSample;
 use std::collections::VecDeque;
 

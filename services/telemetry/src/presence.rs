@@ -4,13 +4,14 @@
 //! newest session writes at once, the others a little later if it has not.
 
 use crate::inner::Inner;
+use midshift_core::heartbeat::Live;
 use midshift_core::ids::RobotId;
 use midshift_core::item::{Expect, Item};
 use midshift_core::limits;
-use midshift_core::robot::Presence;
+use midshift_core::presence::Presence;
+use midshift_core::presence::PresenceRow;
 use midshift_core::rows::{Record, Revision, Writer};
 use midshift_core::time::{LinkDuration, LinkTime, Utc};
-use midshift_core::work::{Live, PresenceRow};
 use midshift_store::{Query, Store};
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -3,12 +3,15 @@
 //! Invariant: telemetry only composes and sends desired state; it never changes or re-dates it.
 
 use crate::stops::SiteStops;
+use midshift_core::desired_state::{DesiredPolicy, DesiredWork};
 use midshift_core::fleet::rows::RobotControl;
+use midshift_core::heartbeat::Live;
 use midshift_core::ids::{AreaId, RobotId, WaypointId};
+use midshift_core::presence::PresenceRow;
 use midshift_core::rows::Seq;
+use midshift_core::session::{LaneMark, Session};
 use midshift_core::site::Site;
 use midshift_core::update::DesiredUpdate;
-use midshift_core::work::{DesiredPolicy, DesiredWork, LaneMark, Live, PresenceRow, Session};
 use midshift_store::{Dirty, LiveBoard};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};

@@ -7,8 +7,8 @@ use midshift_core::Boxed;
 use midshift_core::item::Item;
 use midshift_core::limits;
 use midshift_core::rows::{Record, Row, Table, Writer};
+use midshift_core::session::{LaneMark, Session};
 use midshift_core::time::{Clock, Utc};
-use midshift_core::work::{LaneMark, Session};
 use midshift_store::{Cursor, Error, FrameLog, FrameMark, Query, Store, expired_rows, load};
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -18,14 +18,15 @@ use crate::stops::StopNews;
 use crate::waits::{finish, is_cut_off, next_replay, sleep_until, until_over};
 use crate::welcome::Begun;
 use midshift_core::fleet::REPORT_TOO_LONG;
+use midshift_core::heartbeat::Live;
 use midshift_core::ids::RobotId;
 use midshift_core::item::{Fact, Item};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::robot::Lane;
+use midshift_core::robot_events::{InboxEntry, InboxItem};
 use midshift_core::rows::{Log, Writer};
 use midshift_core::time::{LinkDuration, SiteTime};
-use midshift_core::work::{InboxEntry, InboxItem, Live};
 use midshift_proto::GoAwayNotice;
 use midshift_proto::link::v1;
 use midshift_proto::session::{

@@ -5,8 +5,8 @@
 //! reach the database extends no authority; when that lasts, its sessions end and its robots go to another.
 
 use crate::projection::LinkProjection;
+use midshift_core::heartbeat::Live;
 use midshift_core::ids::RobotId;
-use midshift_core::work::Live;
 use midshift_store::{HeartbeatLog, LiveBoard, SavedHeartbeats, StoredHeartbeat};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};

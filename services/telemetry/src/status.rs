@@ -10,8 +10,8 @@ use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::Reason;
 use midshift_core::robot::Lane;
+use midshift_core::robot_events::InboxItem;
 use midshift_core::time::Utc;
-use midshift_core::work::InboxItem;
 use midshift_proto::link::v1;
 use midshift_proto::session::{LaneAck, LaneBatch};
 use midshift_store::{Frame, FrameLog, Gap};
@@ -199,7 +199,7 @@ mod tests {
     use super::*;
     use midshift_core::reason::Code;
     use midshift_core::robot::Vitals;
-    use midshift_core::work::{Gap as Announced, Sample, SampleBody};
+    use midshift_core::robot_events::{Gap as Announced, Sample, SampleBody};
 
     const NOW: Utc = Utc(7);
 

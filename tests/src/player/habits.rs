@@ -10,8 +10,8 @@ use midshift_core::robot::{
     Fault, FaultClass, HardwareStop, HeldPlace, Lane, Load, Mode, Pose, ReportedAttempt, ReportedState, StopLevel,
     WorkState,
 };
+use midshift_core::robot_events::{AttemptReport, PlaceNews, RobotEvent, SampleBody, UNREADABLE_WORK, WorkStats};
 use midshift_core::update::{UpdateEvent, UpdateReport, UpdateState};
-use midshift_core::work::{AttemptReport, PlaceNews, RobotEvent, SampleBody, UNREADABLE_WORK, WorkStats};
 use rand::RngExt;
 use rand::seq::{IndexedRandom, IteratorRandom};
 
@@ -78,8 +78,8 @@ impl Player {
             .rev()
             .take(8)
             .filter_map(|(_, sample)| match &sample.body {
-                midshift_core::work::SampleBody::Event(event) => Some(event.clone()),
-                midshift_core::work::SampleBody::Status(_) => None,
+                midshift_core::robot_events::SampleBody::Event(event) => Some(event.clone()),
+                midshift_core::robot_events::SampleBody::Status(_) => None,
             })
             .collect();
         said.into_iter().for_each(|event| self.event(event));

@@ -1,6 +1,6 @@
 //! An attempt of the player, as far as it has come.
 
-use midshift_core::work::Assignment;
+use midshift_core::desired_state::Assignment;
 
 /// An attempt that it took.
 pub(super) struct Job {

@@ -13,12 +13,13 @@ mod work;
 pub use habit::Habit;
 
 use job::Job;
+use midshift_core::desired_state::DesiredWork;
 use midshift_core::ids::{AttemptId, PlaceId, RobotId, TaskId, WaypointId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{HeldPlace, Inventory, Lane, ReportedAttempt, ReportedState, StopLevel, Vitals, WorkState};
+use midshift_core::robot_events::{Gap, InboxItem, PlaceNews, RobotEvent, Sample, SampleBody};
 use midshift_core::site::Site;
-use midshift_core::work::{DesiredWork, Gap, InboxItem, PlaceNews, RobotEvent, Sample, SampleBody};
 use midshift_proto::link::v1;
 use midshift_proto::session::{
     ClockSample, FromRobot, Heartbeat, Hello, LaneAck, LaneBatch, LanePosition, Previous, ToRobot, Uplink, Welcome,

@@ -5,12 +5,12 @@
 use super::Player;
 use super::habit::Habit;
 use super::job::Job;
+use midshift_core::desired_state::{Assignment, DesiredWork};
 use midshift_core::ids::{AttemptId, PlaceId};
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{FAULT_SEMANTIC, Fault, FaultClass, Load, ReportedAttempt, WorkState};
-use midshift_core::work::{
-    Assignment, AttemptReport, DesiredWork, Effect, PlaceNews, RobotEvent, StepKind, WorkStats, WorkStep,
-};
+use midshift_core::robot_events::{AttemptReport, PlaceNews, RobotEvent, WorkStats};
+use midshift_core::step::{Effect, StepKind, WorkStep};
 use rand::RngExt;
 use rand::seq::IndexedRandom;
 

@@ -4,8 +4,8 @@ use crate::observer::Shared;
 use midshift_agent::body::{Body, BodyLimits, BodyNews, BodyOrder, BodyState, Checked};
 use midshift_core::ids::{TaskId, WaypointId};
 use midshift_core::robot::{Fault, HardwareStop, Inventory, Load, Mode, StopLevel};
+use midshift_core::step::StepKind;
 use midshift_core::time::SiteTime;
-use midshift_core::work::StepKind;
 use midshift_sim::handle::SimHandle;
 
 /// The body behind its witness.

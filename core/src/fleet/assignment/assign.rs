@@ -14,9 +14,9 @@ use crate::fleet::tasks::{attempts, errand_reports};
 use crate::fleet::traffic::anchor::anchor;
 use crate::ids::{AttemptId, RobotId, Subject};
 use crate::limits;
+use crate::session::Session;
 use crate::task::{Event, TaskIntake, TaskState};
 use crate::time::Now;
-use crate::work::Session;
 use std::collections::BTreeSet;
 
 /// Gives ready tasks to idle robots, each assignment an item of its own, and gives back who is still idle: of those that were `heard` if

@@ -111,6 +111,6 @@ impl Pool {
 
 /// First goal of what is left of the task.
 fn first_goal(view: &FleetProjection, task: &TaskState, intake: &TaskIntake) -> Option<WaypointIx> {
-    let from = crate::work::from_step(&intake.spec.steps, task.next_step);
+    let from = crate::step::from_step(&intake.spec.steps, task.next_step);
     intake.spec.next_goal(from as usize).and_then(|g| view.site.find(g))
 }

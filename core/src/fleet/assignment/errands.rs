@@ -13,10 +13,10 @@ use crate::fleet::traffic::anchor::anchor;
 use crate::fleet::traffic::starts;
 use crate::ids::{AttemptId, RobotId, Subject, WaypointId};
 use crate::limits;
+use crate::session::Session;
 use crate::site::{Kind, WaypointIx};
 use crate::task::state::Errand;
 use crate::time::Now;
-use crate::work::Session;
 use std::collections::BTreeMap;
 
 /// Sends robots that are still idle to charge or park.

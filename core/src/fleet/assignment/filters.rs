@@ -11,14 +11,15 @@ use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::eligibility::{another_could, decided_by_people, fits, reported};
 use crate::fleet::tasks::{claims, load, plausible};
 use crate::fleet::traffic::{engaged_stops, routing};
+use crate::heartbeat::Live;
 use crate::ids::{RobotId, Subject};
 use crate::limits;
+use crate::presence::Presence;
 use crate::reason::{Code, Reason};
-use crate::robot::Presence;
 use crate::site::WaypointIx;
+use crate::step::StepKind;
 use crate::task::{AttemptPhase, Phase, TaskIntake, TaskState};
 use crate::time::Now;
-use crate::work::{Live, StepKind};
 
 /// Charge that must be left at the charger, permille: an hour and a half of waiting on the way.
 pub const RESERVE_PERMILLE: u64 = 100;
@@ -96,7 +97,7 @@ pub fn pair(
     if routing::is_too_long(view, here, &goals, legs_mm.iter().sum()) {
         return Err(Reason::from(Code::RouteTooLong).with("points_max", limits::ROUTE_POINTS_MAX));
     }
-    let from = crate::work::from_step(&intake.spec.steps, task.next_step) as usize;
+    let from = crate::step::from_step(&intake.spec.steps, task.next_step) as usize;
     let mut trip = Trip::new(load.is_some(), intake.spec.speed_limit_mm_s);
     let mut legs_mm = legs_mm.into_iter();
     for step in intake.spec.steps.iter().skip(from) {
@@ -150,7 +151,7 @@ fn journey(
     intake: &TaskIntake,
 ) -> Result<(WaypointIx, Vec<WaypointIx>), Reason> {
     let here = routing::find(view, live.report.vitals.waypoint.as_ref()).ok_or(Code::RobotUnlocated)?;
-    let from = crate::work::from_step(&intake.spec.steps, task.next_step);
+    let from = crate::step::from_step(&intake.spec.steps, task.next_step);
     let goals: Option<Vec<WaypointIx>> = intake.spec.goals(from as usize).map(|g| view.site.find(g)).collect();
     Ok((here, goals.ok_or(Code::NoRoute)?))
 }

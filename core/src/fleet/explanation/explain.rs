@@ -54,7 +54,7 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
     let position = view.queue.position(task_id);
     let goal = intake
         .spec
-        .next_goal(crate::work::from_step(&intake.spec.steps, task.next_step) as usize)
+        .next_goal(crate::step::from_step(&intake.spec.steps, task.next_step) as usize)
         .and_then(|g| view.site.find(g));
     let mut candidates = Vec::new();
     let mut filtered = BTreeMap::new();
@@ -184,7 +184,7 @@ pub fn robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotI
             .map(|why| closed_places::name_closed(view, why));
         let goal = intake
             .spec
-            .next_goal(crate::work::from_step(&intake.spec.steps, task.next_step) as usize)
+            .next_goal(crate::step::from_step(&intake.spec.steps, task.next_step) as usize)
             .and_then(|g| view.site.find(g));
         let distance_mm = at.zip(goal).and_then(|(at, goal)| view.router.distance_mm(at, goal));
         Some(TaskCandidate { task_id: task_id.clone(), reason, distance_mm })

@@ -11,12 +11,13 @@ use crate::fleet::decision::plan::Plan;
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::eligibility;
+use crate::heartbeat::Live;
 use crate::ids::RobotId;
 use crate::limits;
+use crate::presence::Presence;
 use crate::reason::{Code, Reason};
-use crate::robot::{FaultClass, HardwareStop, Mode, Presence, ReportedState};
+use crate::robot::{FaultClass, HardwareStop, Mode, ReportedState};
 use crate::time::{LinkDuration, Now};
-use crate::work::Live;
 use std::collections::BTreeSet;
 
 /// What is looked at.

@@ -15,12 +15,13 @@ use crate::fleet::projection::rows::{Place, RobotHolder};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::{claims, eligibility, plausible};
 use crate::fleet::traffic::{closed_places, engaged_stops, grants, route_requests, starts};
+use crate::heartbeat::Live;
 use crate::ids::{PlaceId, RobotId};
+use crate::presence::Presence;
 use crate::reason::{Code, Reason};
-use crate::robot::{Mode, Presence, WorkState};
+use crate::robot::{Mode, WorkState};
 use crate::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskState};
 use crate::time::{Now, Utc};
-use crate::work::Live;
 use std::collections::BTreeSet;
 
 /// The fact that names places which are closed.

@@ -16,8 +16,8 @@ use crate::fleet::projection::state::FleetProjection;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::reason::{Code, Reason};
+use crate::robot_events::AttemptReport;
 use crate::time::{LinkDuration, Now};
-use crate::work::AttemptReport;
 
 /// Notes that a robot heard an offer and did not answer it.
 pub fn note_missed_offer(tx: &mut Tx, robot_id: &RobotId) {

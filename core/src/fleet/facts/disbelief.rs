@@ -10,9 +10,10 @@ use crate::fleet::tasks::errand_reports;
 use crate::fleet::tasks::transitions::{self, News, apply_event};
 use crate::ids::{AttemptId, PlaceId, RobotId, TaskId};
 use crate::reason::{Code, Reason};
+use crate::robot::WorkState;
 use crate::robot::{FAULT_DISBELIEVED, Fault, FaultClass};
+use crate::robot_events::AttemptReport;
 use crate::task::Event;
-use crate::work::{AttemptReport, WorkState};
 
 /// The heartbeat says the same: the task asks a person, and the robot is looked at.
 pub fn disbelieve(tx: &mut Tx, robot_id: &RobotId, report: &AttemptReport, place_id: &PlaceId) {

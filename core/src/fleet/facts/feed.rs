@@ -13,10 +13,10 @@ use crate::fleet::tasks::arrivals;
 use crate::ids::RobotId;
 use crate::item::Item;
 use crate::reason::{Code, Reason};
+use crate::robot_events::InboxEntry;
 use crate::rows::{BadRow, Entry, Key, Log, Revision, Row, Seq, Table};
 use crate::task::TaskRequest;
 use crate::time::Now;
-use crate::work::InboxEntry;
 use std::collections::BTreeMap;
 
 /// Logs that fleet reads.

@@ -14,11 +14,10 @@ use crate::fleet::tasks::transitions::{News, apply_event, event_of, release};
 use crate::fleet::tasks::{arrivals, breaker, claims, errand_reports, plausible};
 use crate::ids::{PlaceId, RobotId};
 use crate::reason::{Code, Reason};
+use crate::robot::WorkState;
 use crate::robot::{Lane, Load, Mode};
+use crate::robot_events::{AttemptReport, InboxEntry, InboxItem, PlaceNews, RobotEvent, SampleBody, UNREADABLE_WORK};
 use crate::task::{AttemptPhase, Event};
-use crate::work::{
-    AttemptReport, InboxEntry, InboxItem, PlaceNews, RobotEvent, SampleBody, UNREADABLE_WORK, WorkState,
-};
 
 /// Obeys one entry of the robot inbox.
 pub fn obey_entry(tx: &mut Tx, entry: &InboxEntry, board: &Board, tally: &mut Tally) {

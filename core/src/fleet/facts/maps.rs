@@ -4,15 +4,16 @@
 //! Called at a start, before a process begins to plan, and with each heartbeat that is compared. Invariant: a map is taken only if what the rows say of
 //! the floor is true of it too, or if a person forces it; then each thing in the way is an incident.
 
+use crate::desired_state::RoutePoint;
 use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::rows::Place;
 use crate::fleet::projection::state::FleetProjection;
+use crate::heartbeat::Live;
 use crate::ids::{PlaceId, RobotId, TaskId, WaypointId};
 use crate::reason::{Code, Reason};
 use crate::site::{Site, WaypointIx, read_stored};
 use crate::time::Now;
-use crate::work::{Live, RoutePoint};
 use std::collections::BTreeMap;
 
 /// Names of one kind that an incident lists; of more it says how many.

@@ -11,8 +11,8 @@ use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::RobotId;
 use crate::limits;
+use crate::presence::Presence;
 use crate::reason::{Code, Reason};
-use crate::robot::Presence;
 use crate::time::{Now, Utc};
 
 /// Open incidents of this kind: whose, since when, why.

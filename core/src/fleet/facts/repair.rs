@@ -14,13 +14,16 @@ use crate::fleet::tasks::claims::{PLACES, differences, excess, implausible};
 use crate::fleet::tasks::transitions::{self, News, apply_event, may_suspend};
 use crate::fleet::tasks::{arrivals, errand_reports, load, plausible};
 use crate::fleet::traffic::{route_requests, routing};
+use crate::heartbeat::Live;
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
+use crate::presence::Presence;
 use crate::reason::{Code, Reason};
-use crate::robot::{HardwareStop, Mode, Presence};
+use crate::robot::WorkState;
+use crate::robot::{HardwareStop, Mode};
+use crate::robot_events::{AttemptReport, PlaceNews};
 use crate::task::{Attempt, AttemptPhase, Event, Phase};
 use crate::time::Now;
-use crate::work::{AttemptReport, Live, PlaceNews, WorkState};
 
 /// Counts the time in which a robot is heard.
 fn count_attached_time(view: &mut FleetProjection, robot_id: &RobotId, board: &Board, now: &Now) {

@@ -10,14 +10,14 @@ use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{HoldToken, RobotControl};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::traffic::engaged_stops::{self, over};
+use crate::heartbeat::Live;
 use crate::ids::{RobotId, StopId};
 use crate::limits;
+use crate::presence::Presence;
 use crate::reason::{Code, Reason};
-use crate::robot::Presence;
 use crate::stop::latch::is_memory_lost;
 use crate::stop::robot::is_silence;
 use crate::time::Now;
-use crate::work::Live;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// How a stop holds a robot.

@@ -13,14 +13,15 @@ use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::transitions::{self, News};
 use crate::fleet::tasks::{eligibility, errand_reports, load};
 use crate::fleet::traffic::routing;
+use crate::heartbeat::Live;
 use crate::ids::{DrainId, RobotId};
 use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::reason::{Code, Reason};
 use crate::site::{Kind, WaypointIx};
+use crate::step::StepKind;
 use crate::task::Event;
 use crate::task::state::Errand;
 use crate::time::Now;
-use crate::work::{Live, StepKind};
 
 /// Speed that an estimate of a task's rest counts with, millimetres per second.
 const PLANNED_MM_S: u64 = 600;

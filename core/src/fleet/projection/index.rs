@@ -9,10 +9,10 @@ use super::state::FleetProjection;
 use crate::ids::{RobotId, TaskId};
 use crate::policy::AreaPolicy;
 use crate::projection::Indexed;
+use crate::session::Session;
 use crate::stop::record::StopRecord;
 use crate::task::{Attempt, Phase, TaskIntake, TaskState};
 use crate::time::Utc;
-use crate::work::Session;
 
 impl Indexed<TaskState> for FleetProjection {
     fn changed(view: &mut Self, id: &str, _old: Option<&TaskState>) {

@@ -1,11 +1,12 @@
 //! Whether a robot is heard, and whether what it says may be compared with the rows. Reads only; called by every room that acts on a heartbeat.
 
 use super::state::FleetProjection;
+use crate::heartbeat::Live;
 use crate::ids::RobotId;
 use crate::limits;
-use crate::robot::{Lane, Presence};
+use crate::presence::Presence;
+use crate::robot::Lane;
 use crate::time::Now;
-use crate::work::Live;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 

@@ -4,10 +4,10 @@ use super::command::Command;
 use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, RolloutId, SiteId, StopId, TaskId};
 use crate::reason::Reason;
 use crate::robot::{Duty, Inventory};
+use crate::robot_events::WorkStats;
 use crate::rows::{Index, Record, Seq, Table, body_is_json};
 use crate::site::PlaceKind;
 use crate::time::Utc;
-use crate::work::WorkStats;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 

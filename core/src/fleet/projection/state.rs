@@ -9,6 +9,7 @@ use super::rows::{
     AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, PlaceHolder, RobotAuthority, RobotControl,
     RobotCounter, RobotHolder, ServiceClock, SiteRow, Timer,
 };
+use crate::desired_state::{DesiredPolicy, DesiredWork};
 use crate::fleet::bugs::Bugs;
 use crate::identity::RobotIdentity;
 use crate::ids::{AttemptId, RobotId, TaskId};
@@ -17,13 +18,13 @@ use crate::policy::AreaPolicy;
 use crate::projection::{Indexed, projection};
 use crate::reason::Reason;
 use crate::rows::Seq;
+use crate::session::{LaneMark, Session};
 use crate::site::Site;
 use crate::site::route::{Blocked, Router};
 use crate::stop::record::StopRecord;
 use crate::task::{Attempt, Phase, TaskIntake, TaskState};
 use crate::time::{Now, Utc};
 use crate::unknown_rows::UnknownRows;
-use crate::work::{DesiredPolicy, DesiredWork, LaneMark, Session};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, OnceLock};
 

@@ -17,11 +17,14 @@ use super::{claims, plausible};
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::rows::HolderState;
 use crate::fleet::projection::state::FleetProjection;
+use crate::heartbeat::Live;
 use crate::ids::{AttemptId, PlaceId, RobotId};
+use crate::robot::WorkState;
+use crate::robot_events::AttemptReport;
 use crate::site::Site;
+use crate::step::{Effect, StepKind, WorkStep, from_step};
 use crate::task::{Attempt, AttemptPhase};
 use crate::time::Now;
-use crate::work::{AttemptReport, Effect, Live, StepKind, WorkState, WorkStep, from_step};
 
 /// The standing place where the step ends; none: it is no goto, or nothing is reserved there.
 fn goal<'s>(site: &'s Site, step: &WorkStep) -> Option<&'s PlaceId> {

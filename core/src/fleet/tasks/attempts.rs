@@ -4,10 +4,11 @@ use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::{RobotAuthority, RobotHolder};
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{AttemptId, RobotId};
+use crate::robot_events::WorkStats;
+use crate::step::{Effect, StepKind, WorkStep};
 use crate::task::state::{Errand, VisitedPlaces};
 use crate::task::{Attempt, AttemptPhase};
 use crate::time::SiteDuration;
-use crate::work::{Effect, StepKind, WorkStats, WorkStep};
 
 /// Longest errand; a charge ends long before. Site clock.
 pub const ERRAND_TIMEOUT: SiteDuration = SiteDuration::from_secs(4 * 3600);

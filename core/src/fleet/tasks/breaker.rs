@@ -16,8 +16,9 @@ use crate::fleet::projection::rows::RobotControl;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::reason::{Code, Reason};
+use crate::robot::WorkState;
+use crate::robot_events::AttemptReport;
 use crate::task::{Phase, TaskState};
-use crate::work::{AttemptReport, WorkState};
 
 /// Notes a failure of the robot; three within the window open its breaker.
 pub(in crate::fleet) fn trip(tx: &mut Tx, robot_id: &RobotId) {

@@ -15,12 +15,13 @@ use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::{HolderState, Incident, Place, PlaceHolder};
 use crate::fleet::projection::state::{self, FleetProjection};
+use crate::heartbeat::Live;
 use crate::ids::{PlaceId, RobotId};
 use crate::limits;
 use crate::reason::{Code, Reason};
+use crate::robot_events::PlaceNews;
 use crate::stop::Region;
 use crate::time::Now;
-use crate::work::{Live, PlaceNews};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// What an incident calls the places that a robot says it is inside of.

@@ -6,12 +6,13 @@ use super::load;
 use crate::fleet::decision::slice::Slice;
 use crate::fleet::projection::rows::RobotControl;
 use crate::fleet::projection::state::FleetProjection;
+use crate::heartbeat::Live;
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, FaultClass, HardwareStop, Mode, StopLevel};
+use crate::session::Session;
 use crate::task::raw::parse_version;
 use crate::task::{TaskIntake, TaskState};
-use crate::work::{Live, Session};
 use std::collections::BTreeMap;
 
 pub(in crate::fleet) fn decided_by_people(

@@ -10,9 +10,10 @@ use crate::fleet::projection::state::FleetProjection;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::reason::Reason;
+use crate::robot::WorkState;
+use crate::robot_events::AttemptReport;
 use crate::task::state::{Errand, Uncertain};
 use crate::task::{Attempt, AttemptPhase};
-use crate::work::{AttemptReport, WorkState};
 
 /// Counts errands that are on their way to a stop.
 pub fn count_stopping(view: &FleetProjection) -> usize {

@@ -7,17 +7,20 @@
 //!    the load: a heartbeat may be under way that still names it.
 //! 3. A robot that drains is given no work but the rest of the task whose item it carries.
 
+use crate::desired_state::LoadWord;
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{Drain, DrainState, LoadSettled, RobotControl};
 use crate::fleet::projection::state::FleetProjection;
+use crate::heartbeat::Live;
 use crate::ids::RobotId;
+use crate::presence::Presence;
 use crate::reason::{Code, Kind, Reason, Refusal};
-use crate::robot::{Load, Presence};
+use crate::robot::Load;
+use crate::step::Effect;
 use crate::task::{Phase, TaskIntake, TaskState};
 use crate::time::Now;
-use crate::work::{Effect, Live, LoadWord};
 
 /// What a robot carries by its newest heartbeat, unless a person has said since, while it was not heard, that it carries nothing.
 pub fn carried<'l>(view: &FleetProjection, live: &'l Live) -> Option<&'l Load> {

@@ -11,10 +11,13 @@
 use super::{attempts, claims};
 use crate::fleet::projection::liveness;
 use crate::fleet::projection::state::FleetProjection;
+use crate::heartbeat::Live;
 use crate::ids::{AttemptId, RobotId};
 use crate::reason::{Code, Reason};
+use crate::robot::WorkState;
+use crate::robot_events::AttemptReport;
+use crate::step::Effect;
 use crate::task::{Attempt, AttemptPhase, TaskIntake};
-use crate::work::{AttemptReport, Effect, Live, WorkState};
 
 /// Steps that reports of one attempt may name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

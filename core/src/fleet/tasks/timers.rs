@@ -11,8 +11,8 @@ use crate::fleet::projection::rows::{Timer, TimerKind};
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{AttemptId, Subject, TaskId};
 use crate::limits;
+use crate::presence::Presence;
 use crate::reason::{Code, Reason};
-use crate::robot::Presence;
 use crate::task::{AfterStopping, Event, Phase};
 use crate::time::Now;
 

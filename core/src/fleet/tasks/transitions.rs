@@ -7,14 +7,17 @@ use super::{arrivals, attempts, breaker, eligibility, load, plausible};
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::{HolderState, RobotAuthority, RobotCounter, RobotHolder, Timer, TimerKind};
 use crate::fleet::projection::state::FleetProjection;
+use crate::heartbeat::Live;
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::FaultClass;
+use crate::robot::WorkState;
+use crate::robot_events::AttemptReport;
+use crate::step::Effect;
 use crate::task::machine::{AttemptAction, Facts, Next, Standing, next};
 use crate::task::state::Uncertain;
 use crate::task::{AfterStopping, Attempt, AttemptPhase, Event, Phase, TaskIntake, TaskState};
-use crate::work::{AttemptReport, Effect, Live, WorkState};
 
 /// What happened to a task, with what is known about it.
 #[derive(Clone, Copy, Debug)]
@@ -232,8 +235,8 @@ fn counter(tx: &mut Tx, robot_id: &RobotId, software: &str) -> RobotCounter {
         software: software.to_owned(),
         succeeded: 0,
         failures: std::collections::BTreeMap::new(),
-        stats: crate::work::WorkStats::default(),
-        errands: crate::work::WorkStats::default(),
+        stats: crate::robot_events::WorkStats::default(),
+        errands: crate::robot_events::WorkStats::default(),
         attached_ms: 0,
         counted: tx.now.utc,
     });

@@ -11,12 +11,13 @@ use crate::fleet::{Board, Pace, Plan, Tally, ensure_site_rows};
 use crate::ids::{AttemptId, PlaceId, RobotId, WaypointId};
 use crate::reason::{Code, Reason};
 use crate::robot::{FAULT_DISBELIEVED, Lane, WorkState};
+use crate::robot_events::{
+    AttemptReport, Gap, InboxEntry, InboxItem, PlaceNews, RobotEvent, Sample, SampleBody, WorkStats,
+};
 use crate::site::CORRIDOR;
+use crate::step::Effect;
 use crate::task::raw::RawStepKind;
 use crate::task::{AttemptPhase, Phase, RawTask};
-use crate::work::{
-    AttemptReport, Effect, Gap, InboxEntry, InboxItem, PlaceNews, RobotEvent, Sample, SampleBody, WorkStats,
-};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 

@@ -16,16 +16,17 @@ mod unexplained;
 
 use super::projection::{FleetProjection, RevisedRow};
 use super::{Board, Pace, Plan, cycle};
+use crate::heartbeat::Live;
 use crate::ids::{AttemptId, RobotId, TaskId, WaypointId};
 use crate::item::{Item, Write};
 use crate::reason::Reason;
 use crate::robot::{Inventory, ReportedAttempt, ReportedState, Vitals, WorkState};
 use crate::rows::{Record, Revision, Row};
+use crate::session::Session;
 use crate::site::{CORRIDOR, text};
 use crate::task::forms::Transport;
 use crate::task::{RawTask, TaskIntake, TaskState};
 use crate::time::{LinkTime, Now, SiteTime, Utc};
-use crate::work::{Live, Session};
 use std::sync::Arc;
 
 /// UTC when every rig begins.

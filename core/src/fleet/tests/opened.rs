@@ -5,7 +5,7 @@ use crate::fleet::facts::inbox;
 use crate::fleet::tasks::plausible::passes_irreversible;
 use crate::ids::Subject;
 use crate::robot::Load;
-use crate::work::{AttemptReport, WorkStats};
+use crate::robot_events::{AttemptReport, WorkStats};
 
 #[test]
 fn a_report_that_passes_a_step_which_must_not_be_done_twice_opens_the_task() {

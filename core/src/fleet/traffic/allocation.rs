@@ -11,11 +11,11 @@ use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::memory::Waiting;
 use crate::fleet::projection::rows::RobotControl;
 use crate::fleet::projection::state::FleetProjection;
+use crate::heartbeat::Live;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::site::PlaceIx;
 use crate::time::{Now, SiteTime, Utc};
-use crate::work::Live;
 
 /// Grants places to all robots that wait, in queue order. Each grant is an item of its own.
 pub fn allocate_places(view: &mut FleetProjection, board: &Board, now: Now, plan: &mut Plan) -> Releases {

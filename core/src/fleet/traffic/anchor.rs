@@ -3,10 +3,10 @@
 use crate::authority::Authority;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::state::FleetProjection;
+use crate::heartbeat::Live;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::time::{LinkDuration, Now};
-use crate::work::Live;
 
 /// The generation that the next write of a robot's work will have.
 pub fn next_generation(view: &FleetProjection, robot_id: &RobotId, now: &Now) -> u64 {

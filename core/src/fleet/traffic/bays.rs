@@ -3,6 +3,7 @@
 use super::desired::{Release, Releases};
 use super::grants::{self, Occupancy};
 use super::{route_requests, routing};
+use crate::desired_state::Assignment;
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::HolderState;
 use crate::fleet::projection::state::FleetProjection;
@@ -11,7 +12,6 @@ use crate::site::route::segments;
 use crate::site::{Kind, PlaceIx};
 use crate::task::Attempt;
 use crate::time::{SiteDuration, SiteTime};
-use crate::work::Assignment;
 
 /// A robot that blocks a place others need steps aside after this long, at once if somebody waits for it.
 const STEP_ASIDE_AFTER: SiteDuration = SiteDuration::from_secs(3);

@@ -6,17 +6,19 @@
 use super::anchor::{anchor, is_worn, next_generation};
 use super::routing;
 use crate::authority::Authority;
+use crate::desired_state::{AreaRules, Assignment, DesiredPolicy, DesiredWork, GrantedPlace, RoutePoint};
 use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::{HolderState, RobotHolder};
 use crate::fleet::projection::state::{FleetProjection, held};
 use crate::fleet::tasks::{attempts, claims, load};
+use crate::heartbeat::Live;
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
 use crate::robot::ReportedAttempt;
+use crate::robot::WorkState;
 use crate::task::{AfterStopping, Attempt, AttemptPhase};
-use crate::work::{AreaRules, Assignment, DesiredPolicy, DesiredWork, GrantedPlace, Live, RoutePoint, WorkState};
 use std::collections::BTreeMap;
 
 /// What a robot may do from this cycle on; `desired` writes it down.
@@ -134,7 +136,7 @@ fn begin(view: &FleetProjection, a: &Attempt, live: Option<&Live>) -> Option<Ass
         }
         None => (attempts::steps(view, a), attempts::ERRAND_TIMEOUT.as_ms(), 0, None),
     };
-    let from_step = crate::work::from_step(&steps, resume_step);
+    let from_step = crate::step::from_step(&steps, resume_step);
     let goals = routing::goals(&view.site, &steps, from_step)?;
     let route = match here {
         Some(here) => routing::route(view, here, None, &goals)?,

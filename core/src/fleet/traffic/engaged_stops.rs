@@ -1,12 +1,12 @@
 //! What the copy of the fleet stops says of now: which robots they keep work from, and which places they close.
 
 use crate::fleet::projection::state::FleetProjection;
+use crate::heartbeat::Live;
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
 use crate::robot::StopLevel;
 use crate::site::{PlaceIx, Site};
 use crate::stop::{Scope, Stop};
-use crate::work::Live;
 use std::collections::BTreeSet;
 
 /// Stops that are engaged, as they were copied. What was reset is not looked at.

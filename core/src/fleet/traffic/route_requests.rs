@@ -4,18 +4,19 @@
 //! that stands in a passage with no standing place ahead. Others may be waiting for that passage.
 
 use super::routing;
+use crate::desired_state::Assignment;
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{HolderState, Place, PlaceHolder};
 use crate::fleet::projection::state::{self, FleetProjection};
 use crate::fleet::tasks::plausible;
+use crate::heartbeat::Live;
 use crate::ids::{PlaceId, RobotId};
-use crate::robot::Presence;
+use crate::presence::Presence;
 use crate::site::route::{Segment, segments};
 use crate::site::{PlaceIx, PlaceKind};
 use crate::task::spec::Class;
 use crate::task::{Attempt, AttemptPhase};
 use crate::time::{Now, SiteTime};
-use crate::work::{Assignment, Live};
 use std::collections::BTreeSet;
 
 /// A robot that needs more of its route.

@@ -1,12 +1,13 @@
 //! Routes as robots get them: from where a robot stands through every goal that is left, around places that are closed.
 
 use super::engaged_stops;
+use crate::desired_state::RoutePoint;
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::WaypointId;
 use crate::limits;
 use crate::site::route::Blocked;
 use crate::site::{Site, WaypointIx};
-use crate::work::{RoutePoint, StepKind, WorkStep};
+use crate::step::{StepKind, WorkStep};
 
 /// Places that no route may lead into now: found once, until a place or a stop changes.
 pub fn closed(view: &FleetProjection) -> &Blocked {

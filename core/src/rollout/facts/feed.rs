@@ -6,13 +6,13 @@ use super::reports;
 use crate::item::Item;
 use crate::projection;
 use crate::reason::{Code, Reason};
+use crate::robot_events::InboxEntry;
 use crate::rollout::decision::plan::{Plan, Tx, incident};
 use crate::rollout::projection::ended;
 use crate::rollout::projection::rows::OtaMark;
 use crate::rollout::projection::state::RolloutProjection;
 use crate::rows::{BadRow, Entry, Key, Log, Revision, Row, Seq, Table};
 use crate::time::Now;
-use crate::work::InboxEntry;
 
 /// Logs that the service reads.
 pub const LOGS: &[Log] = &[Log::Ota, Log::Fleet, Log::Telemetry, Log::RobotInbox];

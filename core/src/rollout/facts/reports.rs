@@ -3,10 +3,12 @@
 //! Invariant: what a robot says changes rows only; what follows from it is decided in `robots::due` and `phases`. A
 //! heartbeat counts only once everything the robot had said before it was taken.
 
+use crate::heartbeat::Live;
 use crate::ids::{DrainId, RobotId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::{Fault, HardwareStop};
+use crate::robot_events::{InboxEntry, InboxItem, RobotEvent, SampleBody};
 use crate::rollout::decision::plan::Tx;
 use crate::rollout::judgement::failures::fail;
 use crate::rollout::projection::queue::is_directive_old;
@@ -14,7 +16,6 @@ use crate::rollout::projection::rows::{RobotSoftware, RolloutRobot, Step};
 use crate::rollout::projection::state::RolloutProjection;
 use crate::rollout::robots::moves;
 use crate::update::{UpdateEvent, UpdateReport, UpdateState};
-use crate::work::{InboxEntry, InboxItem, Live, RobotEvent, SampleBody};
 
 /// Obeys what a robot says in one entry of the inbox.
 pub fn obey_event(tx: &mut Tx, entry: &InboxEntry) {

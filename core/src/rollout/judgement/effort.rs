@@ -69,8 +69,8 @@ pub fn find_excess(efforts: &Efforts, limits: &EffortLimits) -> Option<Reason> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::robot_events::WorkStats;
     use crate::time::Utc;
-    use crate::work::WorkStats;
     use std::collections::BTreeMap;
 
     const CONTROL: Effort = Effort {

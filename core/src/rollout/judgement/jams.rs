@@ -7,13 +7,15 @@
 use super::infrastructure::is_open_to;
 use crate::fleet::Board;
 use crate::fleet::liveness;
+use crate::heartbeat::Live;
 use crate::ids::RobotId;
 use crate::limits;
-use crate::robot::{HardwareStop, Mode, Presence, StopLevel};
+use crate::presence::Presence;
+use crate::robot::WorkState;
+use crate::robot::{HardwareStop, Mode, StopLevel};
 use crate::rollout::projection::rows::{Rollout, RolloutRobot};
 use crate::rollout::projection::state::RolloutProjection;
 use crate::time::{Now, SiteDuration};
-use crate::work::{Live, WorkState};
 
 /// Whether the bundle has jammed a robot on trial whose gate is open.
 pub fn is_blamed(view: &RolloutProjection, board: &Board, now: &Now, rollout: &Rollout, r: &RolloutRobot) -> bool {

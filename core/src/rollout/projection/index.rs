@@ -8,7 +8,7 @@ use super::state::RolloutProjection;
 use crate::fleet::rows::RobotControl;
 use crate::ids::{RobotId, RolloutId};
 use crate::projection::Indexed;
-use crate::work::Session;
+use crate::session::Session;
 use std::collections::BTreeMap;
 
 impl Indexed<RolloutRobot> for RolloutProjection {

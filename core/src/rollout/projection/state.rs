@@ -12,20 +12,22 @@ use super::rows::{
 use crate::fleet::Board;
 use crate::fleet::liveness;
 use crate::fleet::rows::{AreaBudget, Drain, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
+use crate::heartbeat::Live;
 use crate::ids::{AreaId, DrainId, RobotId, RolloutId};
 use crate::limits;
 use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::policy::AreaPolicy;
+use crate::presence::Presence;
 use crate::projection::{Indexed, projection};
 use crate::reason::Code;
-use crate::robot::{Duty, Lane, Presence};
+use crate::robot::{Duty, Lane};
 use crate::rollout::bugs::Bugs;
 use crate::rows::{BadRow, Row, Seq};
+use crate::session::{LaneMark, Session};
 use crate::site::Site;
 use crate::time::{LinkTime, Now};
 use crate::unknown_rows::UnknownRows;
 use crate::update::{DesiredUpdate, UpdateReport};
-use crate::work::{LaneMark, Live, Session};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 

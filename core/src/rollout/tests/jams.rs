@@ -2,8 +2,8 @@
 
 use super::*;
 use crate::ids::{AttemptId, Subject};
+use crate::robot::WorkState;
 use crate::robot::{ReportedAttempt, StopLevel};
-use crate::work::WorkState;
 
 /// The robot has work, and has not got on with it since the rig began, or gets on with it now.
 fn has_work(rig: &mut Rig, n: usize, gets_on: bool) {

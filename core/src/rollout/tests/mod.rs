@@ -35,12 +35,14 @@ use crate::fleet::maintenance::{budget, drain};
 use crate::fleet::rows::{
     DrainState, HolderState, Place, PlaceHolder, RobotAuthority, RobotControl, RobotCounter, RobotHolder,
 };
+use crate::heartbeat::Live;
 use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId, WaypointId};
 use crate::item::{Expect, Item, Write};
 use crate::maintenance::ReleasedBy;
 use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason, Refusal};
 use crate::robot::{Fault, HardwareStop, Inventory, Lane, Load, ReportedState, Vitals};
+use crate::robot_events::{InboxEntry, InboxItem, RobotEvent, Sample, SampleBody, WorkStats};
 use crate::rollout::commands::carry_out::{carry_out, decide_request};
 use crate::rollout::commands::check::check_command;
 use crate::rollout::decision::directive::{Order, Sign};
@@ -54,10 +56,10 @@ use crate::rollout::projection::{RolloutProjection, RowMap};
 use crate::rollout::robots::{due, machine};
 use crate::rollout::{absorb, cycle};
 use crate::rows::{Entry, Key, Log, Record, Revision, Row, Seq, Table};
+use crate::session::{LaneMark, Session};
 use crate::site::{DEMO, PlaceKind, Site};
 use crate::time::{LinkTime, Now, SiteTime, Utc};
 use crate::update::{DesiredUpdate, Goal, UpdateEvent, UpdateReport, UpdateState};
-use crate::work::{InboxEntry, InboxItem, LaneMark, Live, RobotEvent, Sample, SampleBody, Session, WorkStats};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 

@@ -10,9 +10,9 @@ use midshift_core::ids::{DrainId, PlaceId, SetId};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::{HardwareStop, Lane, Mode};
+use midshift_core::robot_events::RobotEvent;
 use midshift_core::time::{LinkDuration, Now};
 use midshift_core::update::{UpdateEvent, UpdateState};
-use midshift_core::work::RobotEvent;
 
 /// A grant that did not come is asked for again after this.
 const ASK_AGAIN: LinkDuration = LinkDuration(10_000);

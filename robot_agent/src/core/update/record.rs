@@ -8,8 +8,8 @@ use crate::storage::{Op, SoftwareRow, Update};
 use crate::update::Job;
 use midshift_core::reason::Reason;
 use midshift_core::robot::Lane;
+use midshift_core::robot_events::RobotEvent;
 use midshift_core::update::{UpdateEvent, UpdateReport, UpdateState};
-use midshift_core::work::RobotEvent;
 
 impl AgentCore {
     pub(super) fn put_software(&mut self, row: SoftwareRow) {

@@ -5,13 +5,13 @@
 
 use super::budget::{Judge, Pace, RobotReport, Seen};
 use midshift_core::fleet::rows::Drain;
+use midshift_core::heartbeat::Live;
 use midshift_core::ids::{AreaId, RobotId};
 use midshift_core::rollout::rows::{Rollout, RolloutRobot};
 use midshift_core::rows::{BadRow, Seq, Table};
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
 use midshift_core::update::UpdateState;
-use midshift_core::work::Live;
 use midshift_sim::journal::{self, Effect};
 use midshift_store::{Change, Fold, LiveBoard, Projection, Store};
 use std::collections::BTreeMap;

@@ -2,9 +2,9 @@
 
 use crate::harness::{Answer, World};
 use midshift_core::reason::Code;
+use midshift_core::robot::WorkState;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::{AttemptPhase, Phase};
-use midshift_core::work::WorkState;
 use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;

@@ -3,10 +3,10 @@
 use crate::harness::{Answer, World};
 use midshift_core::fleet::rows::RobotCounter;
 use midshift_core::reason::Code;
+use midshift_core::robot::WorkState;
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
 use midshift_core::task::state::Errand;
-use midshift_core::work::WorkState;
 use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;

@@ -1,13 +1,13 @@
 //! Several processes of fleet over one store: one plans, the others stand by and carry out what people ask.
 
 use crate::harness::{Shaky, World};
+use midshift_core::desired_state::DesiredPolicy;
 use midshift_core::fleet::rows::SiteRow;
 use midshift_core::leadership::FleetLeader;
 use midshift_core::reason::Code;
 use midshift_core::rows::Table;
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
-use midshift_core::work::DesiredPolicy;
 use midshift_fleet::FleetService;
 use midshift_proto::access::local;
 use midshift_proto::fleet::v1;

@@ -14,7 +14,7 @@ async fn rules_put_for_an_area_reach_every_robot() {
     w.robot("r1", "park-a").await;
     w.robot("r2", "park-b").await;
     w.until("both have the site's rules", |s| {
-        ["r1", "r2"].iter().all(|r| s.get::<midshift_core::work::DesiredPolicy>(r).is_some())
+        ["r1", "r2"].iter().all(|r| s.get::<midshift_core::desired_state::DesiredPolicy>(r).is_some())
     })
     .await;
     let get = v1::GetAreaPolicyRequest { area_id: "rooms".to_owned() };
@@ -27,7 +27,8 @@ async fn rules_put_for_an_area_reach_every_robot() {
     let limit = |s: &crate::harness::Seen, r: &str| s.policy(r).areas[0].speed_limit_mm_s;
     w.until("both have the new rules", |s| ["r1", "r2"].iter().all(|r| limit(s, r) == Some(600))).await;
     w.robot("r3", "A").await;
-    let seen = w.until("who comes later too", |s| s.get::<midshift_core::work::DesiredPolicy>("r3").is_some()).await;
+    let seen =
+        w.until("who comes later too", |s| s.get::<midshift_core::desired_state::DesiredPolicy>("r3").is_some()).await;
     assert_eq!(limit(&seen, "r3"), Some(600));
     assert!(seen.policy("r1").generation >= before.policy("r1").generation);
     w.lawful().await;
@@ -38,7 +39,7 @@ async fn an_area_where_people_walk_is_slow_until_a_person_puts_another_limit() {
     let mut w = World::on(CORRIDOR.replace("speed_limit_mm_s = 1500", "people = true").leak()).await;
     w.robot("r1", "park-a").await;
     let limits = |s: &crate::harness::Seen| {
-        let areas = s.get::<midshift_core::work::DesiredPolicy>("r1").map(|p| p.areas).unwrap_or_default();
+        let areas = s.get::<midshift_core::desired_state::DesiredPolicy>("r1").map(|p| p.areas).unwrap_or_default();
         areas.first().map(|rules| (rules.speed_limit_mm_s, rules.avoidance_distance_mm))
     };
     w.until("the robot has them", |s| limits(s) == Some((Some(600), Some(500)))).await;
@@ -286,7 +287,7 @@ async fn a_person_lets_the_server_ignore_an_attempt_that_nobody_knows_once_its_r
     };
     w.r("r1").lists = vec![midshift_core::robot::ReportedAttempt {
         attempt: attempt.clone(),
-        state: midshift_core::work::WorkState::Executing,
+        state: midshift_core::robot::WorkState::Executing,
         step_index: 1,
         progress: 1,
         route_index: 0,

@@ -4,9 +4,9 @@ use crate::harness::World;
 use midshift_core::fleet::rows::HolderState;
 use midshift_core::ids::PlaceId;
 use midshift_core::robot::HeldPlace;
+use midshift_core::robot_events::{PlaceNews, RobotEvent};
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
-use midshift_core::work::{PlaceNews, RobotEvent};
 use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;
@@ -429,7 +429,7 @@ fn elsewhere() -> midshift_core::robot::ReportedAttempt {
     let task_id = midshift_core::ids::TaskId::parse("T-elsewhere").expect("an id");
     midshift_core::robot::ReportedAttempt {
         attempt: midshift_core::ids::AttemptId { subject: midshift_core::ids::Subject::Task(task_id), epoch: 3 },
-        state: midshift_core::work::WorkState::Executing,
+        state: midshift_core::robot::WorkState::Executing,
         step_index: 1,
         progress: 1,
         route_index: 0,

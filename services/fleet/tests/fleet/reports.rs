@@ -3,10 +3,10 @@
 use crate::harness::{Seen, World, obstacle};
 use midshift_core::ids::{AttemptId, TaskId};
 use midshift_core::robot::Load;
+use midshift_core::robot::WorkState;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
 use midshift_core::task::raw::RawRetry;
-use midshift_core::work::WorkState;
 
 fn twice() -> Option<RawRetry> {
     Some(RawRetry { max_retry_times: 2, interval_ms: Some(1_000), jitter: Some(0.0), ..RawRetry::default() })

@@ -3,10 +3,10 @@
 use crate::harness::{Answer, World, jam, obstacle};
 use midshift_core::reason::Code;
 use midshift_core::robot::Duty;
+use midshift_core::robot::WorkState;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::Phase;
 use midshift_core::task::raw::RawRetry;
-use midshift_core::work::WorkState;
 use midshift_proto::access::local;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService;

@@ -4,9 +4,9 @@ use crate::harness::{Answer, World};
 use midshift_core::fleet::rows::HolderState;
 use midshift_core::ids::TaskId;
 use midshift_core::reason::Code;
+use midshift_core::robot::WorkState;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::{AfterStopping, Ask, AttemptPhase, Phase, Resolution};
-use midshift_core::work::WorkState;
 
 #[tokio::test(start_paused = true)]
 async fn a_waiting_task_is_canceled_at_once() {

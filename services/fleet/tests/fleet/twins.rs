@@ -2,9 +2,9 @@
 
 use crate::harness::{Answer, World};
 use midshift_core::fleet::bugs::{Bugs, SeededBug};
+use midshift_core::robot::WorkState;
 use midshift_core::site::{CORRIDOR, DEMO};
 use midshift_core::task::Phase;
-use midshift_core::work::WorkState;
 
 async fn world(bugs: &[SeededBug]) -> World {
     let mut w = World::with(CORRIDOR, Bugs::seeded(bugs)).await;

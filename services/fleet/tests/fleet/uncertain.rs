@@ -3,9 +3,9 @@
 use crate::harness::World;
 use midshift_core::reason::Code;
 use midshift_core::robot::Mode;
+use midshift_core::robot::WorkState;
 use midshift_core::site::CORRIDOR;
 use midshift_core::task::{AttemptPhase, Phase};
-use midshift_core::work::WorkState;
 
 #[tokio::test(start_paused = true)]
 async fn a_completion_from_an_attempt_nobody_knew_about_is_accepted() {

@@ -11,6 +11,7 @@ use super::requests::{PendingCommand, Question, Request};
 use crate::collect::NamedBundles;
 use crate::service::OtaService;
 use midshift_core::Boxed;
+use midshift_core::heartbeat::Live;
 use midshift_core::ids::RobotId;
 use midshift_core::item::Item;
 use midshift_core::leadership::{LeaderLease, LeaseAction, OtaLeader, OwnEntries};
@@ -25,7 +26,6 @@ use midshift_core::rollout::{Board, LOGS, Plan, Sign, absorb, cycle, decide_requ
 use midshift_core::rows::{Entry, Log, Seq, Table};
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, Now};
-use midshift_core::work::Live;
 use midshift_store::leadership::{self, GroupOutcome};
 use midshift_store::{Applied, CommitError, Dirty, Error, LiveBoard, Store, follow};
 use std::collections::BTreeSet;

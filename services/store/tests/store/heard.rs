@@ -3,11 +3,11 @@
 use crate::support::{
     Bench, clock, database, item, memory, postgres_at, put, say, site, stranger, until_a_writer_waits,
 };
+use midshift_core::heartbeat::{ClockOffset, Live};
 use midshift_core::ids::RobotId;
 use midshift_core::item::{Expect, Item, Silent};
 use midshift_core::robot::ReportedState;
 use midshift_core::rows::{Seq, Table, Writer};
-use midshift_core::work::{ClockOffset, Live};
 use midshift_store::{
     Applied, CommitError, HeartbeatLog, LiveBoard, MemoryHeartbeats, PostgresHeartbeats, PostgresStore, Store,
     StoredHeartbeat, follow_heartbeats,

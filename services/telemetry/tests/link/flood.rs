@@ -3,8 +3,8 @@
 use crate::world::{Result, Robot, World, world};
 use midshift_core::limits;
 use midshift_core::robot::Lane;
+use midshift_core::robot_events::{InboxEntry, InboxItem};
 use midshift_core::rows::{Log, Seq};
-use midshift_core::work::{InboxEntry, InboxItem};
 use midshift_proto::session::LaneAck;
 use std::ops::RangeInclusive;
 use std::time::Duration;

@@ -2,12 +2,12 @@
 
 use crate::world::{Result, Robot, World, clock, serve};
 use async_trait::async_trait;
+use midshift_core::desired_state::DesiredWork;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::item::{Expect, Item};
 use midshift_core::reason::Code;
 use midshift_core::rows::Writer;
 use midshift_core::time::Clock;
-use midshift_core::work::DesiredWork;
 use midshift_proto::session::CloseCode;
 use midshift_store::{
     Error, FrameLog, HeartbeatLog, LiveBoard, MemoryFrames, MemoryHeartbeats, MemoryStore, SavedHeartbeats, Store,

@@ -2,12 +2,13 @@
 
 use crate::stops::{copied, hears, record};
 use crate::world::{Result, Robot, World, hello, world};
+use midshift_core::desired_state::DesiredWork;
 use midshift_core::ids::RobotId;
 use midshift_core::item::{Expect, Item, RowChange, Write};
-use midshift_core::robot::Presence;
+use midshift_core::presence::Presence;
+use midshift_core::presence::PresenceRow;
 use midshift_core::rows::{Record, Writer};
 use midshift_core::stop::Scope;
-use midshift_core::work::{DesiredWork, PresenceRow};
 use midshift_proto::session::{Hello, StopFacts};
 use midshift_store::load;
 use std::time::Duration;

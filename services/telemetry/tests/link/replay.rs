@@ -4,7 +4,7 @@ use crate::disk::Disk;
 use crate::world::{Otherwise, Result, Robot, World, clock, status_samples as samples, world_with};
 use midshift_core::ids::RobotId;
 use midshift_core::robot::Lane;
-use midshift_core::work::InboxItem;
+use midshift_core::robot_events::InboxItem;
 use midshift_proto::link::v1;
 use midshift_proto::link::v1::replay_service_client::ReplayServiceClient;
 use midshift_proto::session::{Downlink, LaneAck, LaneBatch, Previous, StatusReplay};

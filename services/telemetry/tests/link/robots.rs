@@ -4,10 +4,11 @@ use crate::world::{Result, Robot, World, clock, serve, world};
 use midshift_core::fleet::rows::RobotControl;
 use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::item::Item;
+use midshift_core::presence::{LastHeard, PresenceRow};
 use midshift_core::robot::{Inventory, Mode, ReportedState, Vitals};
 use midshift_core::rows::Writer;
+use midshift_core::session::Session;
 use midshift_core::time::Clock;
-use midshift_core::work::{LastHeard, PresenceRow, Session};
 use midshift_proto::access::local;
 use midshift_proto::convert::{ms_of, time_of};
 use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceClient;
@@ -306,7 +307,7 @@ async fn restore(store: &dyn Store, clock: &dyn Clock) -> Result<i64> {
     let heard_unix_ms = clock.now().wall.0 - 3 * 86_400_000;
     let robot_id = RobotId::parse("r1")?;
     let last_heard = LastHeard { at_unix_ms: heard_unix_ms, battery_permille: 640, waypoint: None };
-    let online = midshift_core::robot::Presence::Online;
+    let online = midshift_core::presence::Presence::Online;
     let presence = PresenceRow::new(robot_id, online, heard_unix_ms - 1_000);
     let mut item = Item::new(Writer::Telemetry, "tests");
     item.create(&session("r1", Inventory::default())?, "session.opened");
@@ -344,7 +345,7 @@ async fn a_robot_of_a_backup_is_listed_as_offline_since_it_was_heard_and_never_a
         let row = midshift_store::load::<PresenceRow>(&*store, "r1").await?;
         Ok(row.map(|(row, _)| (row.presence, row.since_unix_ms)))
     };
-    let offline = Some((midshift_core::robot::Presence::Offline, heard_unix_ms));
+    let offline = Some((midshift_core::presence::Presence::Offline, heard_unix_ms));
     for _ in 0..60 {
         if kept().await? == offline {
             return Ok(());

@@ -1,10 +1,10 @@
 //! A second machine with a robot's name: a restart of it, or a copy of its key.
 
 use crate::world::{Result, Robot, World, asked_as, hello, world};
+use midshift_core::desired_state::DesiredPolicy;
 use midshift_core::item::{Expect, Item};
 use midshift_core::limits;
 use midshift_core::rows::{Log, Seq, Writer};
-use midshift_core::work::DesiredPolicy;
 use midshift_proto::session::{CloseCode, Hello, Previous};
 use serde_json::{Value, json};
 use std::time::Duration;

@@ -1,16 +1,18 @@
 //! A robot's session: welcome, acknowledgements, desired state, succession, clones.
 
 use crate::world::{Otherwise, Result, Robot, World, clock, hello, serve, world, world_with};
+use midshift_core::desired_state::DesiredWork;
 use midshift_core::fleet::REPORT_TOO_LONG;
 use midshift_core::ids::{PlaceId, RobotId, SiteId};
 use midshift_core::item::{Expect, Item};
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::robot::{HeldPlace, Lane, Mode, ReportedState};
+use midshift_core::robot_events::{InboxItem, RobotEvent, Sample, SampleBody};
 use midshift_core::rows::{Log, Seq, Writer};
+use midshift_core::session::Session;
 use midshift_core::time::{Clock, Utc};
 use midshift_core::wall_clock::WallClock;
-use midshift_core::work::{DesiredWork, InboxItem, RobotEvent, Sample, SampleBody, Session};
 use midshift_proto::session::{ClockSample, CloseCode, Downlink, Heartbeat, LaneAck, LaneBatch, Uplink};
 use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, StoreId, load};
 use midshift_telemetry::{Bugs, Parts, SeededBug};

@@ -5,7 +5,7 @@ use crate::world::{Otherwise, Result, Robot, clock, status_samples as samples, w
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::robot::Lane;
-use midshift_core::work::{Gap, InboxItem};
+use midshift_core::robot_events::{Gap, InboxItem};
 use midshift_proto::session::{CloseCode, Downlink};
 use midshift_store::{FrameLog, MemoryFrames};
 use midshift_telemetry::{Bugs, SeededBug};

@@ -1,10 +1,11 @@
 //! Telemetry over a real gRPC connection in memory, and a robot that says what a test wants.
 
+use midshift_core::heartbeat::Live;
 use midshift_core::identity::{Caller, Digest, TokenId};
 use midshift_core::ids::{RobotId, SiteId, WaypointId};
 use midshift_core::robot::{Lane, Mode, ReportedState, Vitals};
+use midshift_core::robot_events::{InboxItem, RobotEvent, Sample, SampleBody};
 use midshift_core::time::{Clock, ScaledClock, Utc};
-use midshift_core::work::{InboxItem, Live, RobotEvent, Sample, SampleBody};
 use midshift_proto::GoAwayNotice;
 use midshift_proto::link::v1::link_service_client::LinkServiceClient;
 use midshift_proto::link::v1::{SessionRequest, SessionResponse};

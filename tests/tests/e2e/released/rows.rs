@@ -4,11 +4,15 @@
 //! index columns are those that its table gives it.
 
 use anyhow::{Context, ensure};
+use midshift_core::heartbeat::SharedHeartbeat;
 use midshift_core::idempotency::CommandKey;
 use midshift_core::reason::Reason;
+use midshift_core::robot_events::InboxEntry;
 use midshift_core::rows::{Entry, Key, Log, Record, Revision, Row, Seq, Table};
-use midshift_core::work::{InboxEntry, SharedHeartbeat};
-use midshift_core::{audit, fleet, identity, leadership, maintenance, policy, rollout, stop, task, update, work};
+use midshift_core::session::{LaneMark, Session};
+use midshift_core::{
+    audit, desired_state, fleet, identity, leadership, maintenance, policy, presence, rollout, stop, task, update,
+};
 use midshift_proto::link::v1::LaneBatch;
 use midshift_proto::{parse, session};
 use midshift_store::{FrameLog, HeartbeatLog, Store, follow};
@@ -99,8 +103,8 @@ records! {
     RobotCounter fleet::rows::RobotCounter;
     Site fleet::rows::SiteRow;
     AreaPolicy policy::AreaPolicy;
-    DesiredWork work::DesiredWork;
-    DesiredPolicy work::DesiredPolicy;
+    DesiredWork desired_state::DesiredWork;
+    DesiredPolicy desired_state::DesiredPolicy;
     ServiceClock fleet::rows::ServiceClock;
     FleetMark fleet::rows::FleetMark;
     Incident fleet::rows::Incident;
@@ -108,9 +112,9 @@ records! {
     AreaBudget fleet::rows::AreaBudget;
     CommandKey CommandKey<fleet::projection::command::Command>;
     FleetLeader leadership::FleetLeader;
-    Session work::Session;
-    Presence work::PresenceRow;
-    LaneMark work::LaneMark;
+    Session Session;
+    Presence presence::PresenceRow;
+    LaneMark LaneMark;
     Bundle rollout::rows::Bundle;
     Rollout rollout::rows::Rollout;
     RolloutRobot rollout::rows::RolloutRobot;

@@ -1,10 +1,10 @@
 //! What must be true of everything fleet ever wrote, read from the feed.
 
+use midshift_core::desired_state::DesiredWork;
 use midshift_core::fleet::rows::{RobotAuthority, RobotHolder};
 use midshift_core::ids::{AttemptId, Subject};
 use midshift_core::rows::{Entry, Record, Row, Table};
 use midshift_core::task::{Attempt, AttemptPhase, TaskState};
-use midshift_core::work::DesiredWork;
 use std::collections::BTreeMap;
 
 #[derive(Default)]

@@ -14,15 +14,16 @@ pub use shaky::Shaky;
 
 use midshift_core::fleet::bugs::Bugs;
 use midshift_core::fleet::maps::MapChange;
+use midshift_core::heartbeat::Live;
 use midshift_core::ids::{RobotId, SiteId, TaskId};
 use midshift_core::item::{Expect, Item};
 use midshift_core::rows::{Entry, Record, Seq, Table, Writer};
+use midshift_core::session::{LaneMark, Session};
 use midshift_core::site::{Site, text};
 use midshift_core::stop::record::StopRecord;
 use midshift_core::task::forms::Transport;
 use midshift_core::task::{Ask, Phase, RawTask, TaskIntake, TaskRequest, TaskState};
 use midshift_core::time::{Clock, ScaledClock, Utc};
-use midshift_core::work::{LaneMark, Live, Session};
 use midshift_fleet::{FleetService, MapOutdated, Parts};
 use midshift_store::{LiveBoard, MemoryStore, Store, StoreId};
 use std::collections::BTreeMap;

@@ -1,18 +1,22 @@
 //! A scripted robot: obeys its desired state by the rules of the link, one small act a step, unless a test tells it otherwise.
 
 use midshift_core::authority::{Authority, SentHeartbeats};
+use midshift_core::desired_state::{Assignment, DesiredWork, RoutePoint};
+use midshift_core::heartbeat::Live;
 use midshift_core::ids::{AttemptId, PlaceId, RobotId, StopId, WaypointId};
 use midshift_core::reason::{Code, Reason};
+use midshift_core::robot::WorkState;
 use midshift_core::robot::{
     Fault, HardwareStop, HeldPlace, Inventory, Lane, Load, Mode, Pose, ReportedAttempt, ReportedState, StopLevel,
     Vitals,
 };
-use midshift_core::site::Site;
-use midshift_core::time::{LinkTime, Now, SiteTime};
-use midshift_core::work::{
-    Assignment, AttemptReport, DesiredWork, Effect, InboxEntry, InboxItem, LaneMark, Live, PlaceNews, RobotEvent,
-    RoutePoint, Sample, SampleBody, Session, StepKind, WorkState, WorkStats,
+use midshift_core::robot_events::{
+    AttemptReport, InboxEntry, InboxItem, PlaceNews, RobotEvent, Sample, SampleBody, WorkStats,
 };
+use midshift_core::session::{LaneMark, Session};
+use midshift_core::site::Site;
+use midshift_core::step::{Effect, StepKind};
+use midshift_core::time::{LinkTime, Now, SiteTime};
 use std::collections::BTreeSet;
 
 /// What it does with an offer.

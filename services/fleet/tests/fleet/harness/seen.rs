@@ -1,5 +1,6 @@
 //! All rows at one moment, with names for what tests ask.
 
+use midshift_core::desired_state::{DesiredPolicy, DesiredWork};
 use midshift_core::fleet::rows::{
     HoldToken, HolderState, Incident, Place, RobotAuthority, RobotControl, RobotHolder, Timer,
 };
@@ -8,7 +9,6 @@ use midshift_core::reason::Code;
 use midshift_core::rows::{Key, Record, Row};
 use midshift_core::task::state::Errand;
 use midshift_core::task::{Attempt, Phase, TaskState};
-use midshift_core::work::{DesiredPolicy, DesiredWork};
 use std::collections::BTreeMap;
 
 pub struct Seen {

@@ -114,7 +114,7 @@ impl World {
             "task_id": format!("task-{n}"), "number": n, "phase": "succeeded", "reason": null, "then": null, "holds": [], "epoch": 0,
             "robot_id": null, "opened_robot_id": null, "next_step": 0, "failures": 0, "refusals_in_row": 0, "failed_robots": [],
             "semantic_refusers": [], "queued_since": now, "retry_at": null, "cancel_requested": null, "started": null, "ended": now,
-            "changed": now, "stats": midshift_core::work::WorkStats::default(),
+            "changed": now, "stats": midshift_core::robot_events::WorkStats::default(),
         });
         let state: TaskState = serde_json::from_value(state).expect("a state");
         assert!(state.phase == Phase::Succeeded);
