@@ -5,7 +5,7 @@ use crate::figure::{Figure, percentile};
 use crate::old_store::{self, OldArgs};
 use midshift_core::fleet::projection::{FleetProjection, RevisedRow};
 use midshift_core::fleet::{Board, Pace, Plan, Slice, cycle, ensure_site_rows};
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::{Inventory, ReportedState, Vitals};
 use midshift_core::rows::{Record, Revision, Row};
@@ -187,7 +187,7 @@ fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (
         view.sessions.insert(session.id(), RevisedRow { revision: Revision(1), row: session });
         let waypoint = Some(site.waypoints()[draw(cells)].waypoint_id.clone());
         let vitals = Vitals { waypoint, battery_permille, ..Vitals::default() };
-        let live = Live {
+        let live = NewestHeartbeat {
             robot_id: robot_id.clone(),
             report: ReportedState { hb: 60, session_epoch: 1, vitals, ..ReportedState::default() },
             processed_at: now.link,

@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 /// The newest heartbeat of a robot with what the server knows about it: the volatile face, never a row.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Live {
+pub struct NewestHeartbeat {
     /// The robot that sent it.
     pub robot_id: RobotId,
     /// What it said.
@@ -35,7 +35,7 @@ pub struct ClockOffset {
     pub clock_error_ms: u64,
 }
 
-impl Live {
+impl NewestHeartbeat {
     /// The area in which the robot is: that of the waypoint it was at last. None: not known.
     pub fn area<'s>(&self, site: &'s crate::site::Site) -> Option<&'s AreaId> {
         site.area_at(self.report.vitals.waypoint.as_ref())
@@ -49,7 +49,7 @@ pub struct SharedHeartbeat {
     pub report: crate::robot::ReportedState,
     /// UTC of the gateway's wall at receipt, milliseconds.
     pub received_unix_ms: i64,
-    /// As [`Live::clock`].
+    /// As [`NewestHeartbeat::clock`].
     pub clock: Option<ClockOffset>,
 }
 
@@ -66,7 +66,12 @@ impl SharedHeartbeat {
         serde_json::from_str(text)
     }
     /// As this process knows it from `now` on, where it knew `before` of the robot; none if that is not older.
-    pub fn into_live(self, robot_id: &RobotId, before: Option<&Live>, now: crate::time::Now) -> Option<Live> {
+    pub fn into_newest(
+        self,
+        robot_id: &RobotId,
+        before: Option<&NewestHeartbeat>,
+        now: crate::time::Now,
+    ) -> Option<NewestHeartbeat> {
         let order = |report: &crate::robot::ReportedState| (report.session_epoch, report.hb);
         if before.is_some_and(|before| order(&before.report) >= order(&self.report)) {
             return None;
@@ -75,17 +80,17 @@ impl SharedHeartbeat {
         let progress_at = before.filter(|_| !progressed).map_or(now.site, |before| before.progress_at);
         let Self { report, received_unix_ms, clock } = self;
         let (robot_id, processed_at, processed_site) = (robot_id.clone(), now.link, now.site);
-        Some(Live { robot_id, report, processed_at, processed_site, received_unix_ms, progress_at, clock })
+        Some(NewestHeartbeat { robot_id, report, processed_at, processed_site, received_unix_ms, progress_at, clock })
     }
 }
 
-impl From<&Live> for SharedHeartbeat {
-    fn from(live: &Live) -> Self {
+impl From<&NewestHeartbeat> for SharedHeartbeat {
+    fn from(live: &NewestHeartbeat) -> Self {
         Self { report: live.report.clone(), received_unix_ms: live.received_unix_ms, clock: live.clock }
     }
 }
 
-impl Live {
+impl NewestHeartbeat {
     /// Everything that the robot had written down when it sent this is stored, if its ring stands at `mark`.
     pub fn is_consumed(&self, mark: Option<&LaneMark>) -> bool {
         let done = |lane: Lane, have: u64| self.report.produced.get(&lane).is_none_or(|p| *p <= have);

@@ -2,7 +2,7 @@
 //!
 //! Decided by [`Presence::since`]; written by telemetry.
 
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{RobotId, WaypointId};
 use crate::limits;
 use crate::rows::{Record, Table, body_is_json};
@@ -75,7 +75,7 @@ impl PresenceRow {
         Self { robot_id, presence, since_unix_ms, conditions: Vec::new(), last_heard: None }
     }
     /// The row of a robot after this one, at `wall`. `live`: its newest heartbeat; none: this server has not heard it.
-    pub fn next(&self, presence: Presence, live: Option<&Live>, wall: crate::time::Utc) -> Self {
+    pub fn next(&self, presence: Presence, live: Option<&NewestHeartbeat>, wall: crate::time::Utc) -> Self {
         let Some(live) = live else {
             let since_unix_ms = self.unheard_since_unix_ms();
             return Self { presence, since_unix_ms, ..self.clone() };
@@ -94,7 +94,7 @@ impl PresenceRow {
         }
     }
     /// What keeps the robot from work by its newest heartbeat, since when as far as this row knows.
-    pub fn conditions_of(&self, live: &Live) -> Vec<Condition> {
+    pub fn conditions_of(&self, live: &NewestHeartbeat) -> Vec<Condition> {
         let since =
             |what: &str| self.conditions.iter().find(|known| known.what == what).map(|known| known.since_unix_ms);
         let words = live.report.conditions().into_iter();

@@ -51,7 +51,7 @@ pub type DialFor = Arc<dyn Fn(&RobotId, watch::Receiver<bool>) -> Result<Arc<dyn
 /// How each robot speaks TLS; one that is not in it speaks plain text.
 pub type TlsOf = Arc<BTreeMap<RobotId, Tls>>;
 /// Whether a task still wants its item from the robot that carries it.
-pub type Live = Arc<dyn Fn(&TaskId) -> bool + Send + Sync>;
+pub type IsTaskLive = Arc<dyn Fn(&TaskId) -> bool + Send + Sync>;
 
 /// A swarm that could not start or go on.
 #[derive(Debug, thiserror::Error)]
@@ -109,7 +109,7 @@ pub struct SwarmConfig {
     /// Naive rules for twins of tests; none outside them.
     pub bugs: Bugs,
     /// Which tasks a person leaves to their robots; none: nobody walks about.
-    pub person: Option<Live>,
+    pub person: Option<IsTaskLive>,
     /// What they believe of software; none: theirs is not changed.
     pub software: Option<Trust>,
 }

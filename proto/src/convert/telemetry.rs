@@ -3,7 +3,7 @@
 use super::robot::lane_marks;
 use super::{WireEnum, timestamp};
 use crate::telemetry::v1;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::{AreaId, RobotId};
 use midshift_core::presence::Presence;
 use midshift_core::presence::{Condition, LastHeard, PresenceRow};
@@ -25,7 +25,7 @@ pub struct RobotView<'a> {
     /// Its newest session.
     pub session: Option<&'a Session>,
     /// Its newest heartbeat.
-    pub live: Option<&'a Live>,
+    pub live: Option<&'a NewestHeartbeat>,
     /// The area in which it is, or was when it was heard last; none: not known.
     pub area_id: Option<&'a AreaId>,
     /// Highest durable number of each lane of its ring.
@@ -35,7 +35,7 @@ pub struct RobotView<'a> {
 }
 
 /// Whether a robot is heard: what a row says of one that this server has not heard is of another time.
-pub fn shown_presence(row: Option<&PresenceRow>, live: Option<&Live>) -> Presence {
+pub fn shown_presence(row: Option<&PresenceRow>, live: Option<&NewestHeartbeat>) -> Presence {
     live.and(row).map_or(Presence::Offline, |row| row.presence)
 }
 

@@ -1,6 +1,6 @@
 //! Robots and their events as callers see them.
 
-use midshift_core::heartbeat::{ClockOffset, Live};
+use midshift_core::heartbeat::{ClockOffset, NewestHeartbeat};
 use midshift_core::ids::{RobotId, SetId};
 use midshift_core::presence::Presence;
 use midshift_core::presence::PresenceRow;
@@ -52,7 +52,7 @@ fn a_robot_shows_how_old_its_report_is_and_the_measured_clock_before_the_remembe
         ..Session::new(robot(), 7, Inventory::default())
     };
     let presence = PresenceRow::new(robot(), Presence::Suspect, 4_000);
-    let live = Live {
+    let live = NewestHeartbeat {
         robot_id: robot(),
         report: ReportedState { hb: 9, mode: Mode::Manual, ..ReportedState::default() },
         processed_at: LinkTime(1_000),

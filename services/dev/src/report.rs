@@ -2,7 +2,7 @@
 
 use crate::scenario::Story;
 use crate::task_summary::Tasks;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::TaskId;
 use midshift_core::task::Phase;
 use midshift_core::time::Clock;
@@ -29,7 +29,7 @@ const LOOK_EVERY: Duration = Duration::from_millis(500);
 
 /// Milliseconds of site time in which robots had work and made no progress, summed over robots.
 pub async fn watch_progress(
-    board: Arc<LiveBoard<Live>>,
+    board: Arc<LiveBoard<NewestHeartbeat>>,
     clock: Arc<dyn Clock>,
     sum_ms: Arc<std::sync::atomic::AtomicU64>,
 ) {
@@ -44,7 +44,7 @@ pub async fn watch_progress(
     }
 }
 
-fn is_stuck(live: &Live, now: midshift_core::time::SiteTime) -> bool {
+fn is_stuck(live: &NewestHeartbeat, now: midshift_core::time::SiteTime) -> bool {
     let working = live.report.attempts.iter().any(|a| !a.state.is_over());
     working && now.since(live.progress_at).as_ms() > NO_PROGRESS_MS
 }

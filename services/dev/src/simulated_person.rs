@@ -2,7 +2,7 @@
 //!
 //! Invariant: only silences are resumed, each by its name. A fleet stop stays with whoever resets and resumes it. Called by `dev`.
 
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::StopId;
 use midshift_core::stop::robot::is_silence;
 use midshift_proto::task::v1::ResumeHeldRequest;
@@ -18,13 +18,13 @@ use tonic::transport::Channel;
 const ROUND: Duration = Duration::from_secs(5);
 
 /// Silences that stand robots as these say of themselves.
-fn silences(board: &LiveBoard<Live>) -> BTreeSet<StopId> {
+fn silences(board: &LiveBoard<NewestHeartbeat>) -> BTreeSet<StopId> {
     let standing = board.all().into_iter().flat_map(|(_, latest)| latest.report.awaiting_resume.clone());
     standing.filter(is_silence).collect()
 }
 
 /// Resumes in each round the robots that stand in silence; ends only by being dropped.
-pub async fn resume_silenced(board: Arc<LiveBoard<Live>>, channel: Channel) -> Infallible {
+pub async fn resume_silenced(board: Arc<LiveBoard<NewestHeartbeat>>, channel: Channel) -> Infallible {
     let mut client = TaskServiceClient::new(channel);
     loop {
         tokio::time::sleep(ROUND).await;

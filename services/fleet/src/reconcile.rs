@@ -11,7 +11,7 @@ use midshift_core::fleet::projection::{self, FleetProjection};
 use midshift_core::fleet::{
     Board, LOGS, Pace, Plan, Slice, absorb, commands, cycle, ensure_site_rows, explain, maps, objects,
 };
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::idempotency;
 use midshift_core::identity::Actor;
 use midshift_core::leadership::{FleetLeader, LeaderLease, LeaseAction, OwnEntries};
@@ -40,7 +40,7 @@ pub(crate) struct Loop {
     pub(crate) view: FleetProjection,
     pub(crate) seq: Seq,
     pub(crate) board: Board,
-    dirty: Dirty<Live>,
+    dirty: Dirty<NewestHeartbeat>,
     started: Now,
     /// Until then what others write gathers: thinking takes half of the time at most.
     rested: Instant,

@@ -4,7 +4,7 @@ use midshift_core::fleet::Board;
 use midshift_core::fleet::commands::Command;
 use midshift_core::fleet::maps::MapChange;
 use midshift_core::fleet::projection::FleetProjection;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::identity::Caller;
 use midshift_core::reason::{Reason, Refusal};
 use midshift_core::rows::Revision;
@@ -20,7 +20,7 @@ pub struct Parts {
     /// The memory that services share.
     pub store: Arc<dyn Store>,
     /// Newest heartbeats, written by telemetry.
-    pub board: Arc<LiveBoard<Live>>,
+    pub board: Arc<LiveBoard<NewestHeartbeat>>,
     /// The site.
     pub site: Arc<Site>,
     /// Its text, kept in the store.

@@ -14,7 +14,7 @@ use axum::routing::get;
 use http::StatusCode;
 use midshift_cli::roles::Role;
 use midshift_cli::site_answer::SiteAnswer;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::{Boxed, limits};
 use midshift_edge::{Denials, Listen, Listener};
 use midshift_fleet::{FleetService, Reconciler};
@@ -45,7 +45,7 @@ pub struct Server {
     fleet: Option<(FleetService, Reconciler)>,
     telemetry: Option<TelemetryService>,
     rollouts: Option<(RolloutService, Planner)>,
-    board: Arc<LiveBoard<Live>>,
+    board: Arc<LiveBoard<NewestHeartbeat>>,
     beacons: Option<UdpSocket>,
     /// It was asked to end.
     stop: CancellationToken,
@@ -64,7 +64,7 @@ impl Server {
     async fn build(mut parts: Components, stop: CancellationToken) -> anyhow::Result<Self> {
         parts.ota = parts.ota.with_rows(parts.store.clone());
         parts.reader = parts.reader.map(|reader| reader.with_rows(parts.store.clone()));
-        let board: Arc<LiveBoard<Live>> = LiveBoard::new();
+        let board: Arc<LiveBoard<NewestHeartbeat>> = LiveBoard::new();
         let shutdown = CancellationToken::new();
         let task = match parts.roles.has(Role::Task) {
             true => Some(open_task(&parts, &shutdown).await?),
@@ -123,7 +123,7 @@ impl Server {
         self.fleet.as_ref().map(|(face, _)| face.clone())
     }
     /// Newest heartbeats, for whoever reports in this process.
-    pub fn board(&self) -> Arc<LiveBoard<Live>> {
+    pub fn board(&self) -> Arc<LiveBoard<NewestHeartbeat>> {
         self.board.clone()
     }
 
@@ -379,7 +379,7 @@ async fn changed(watched: &mut Option<watch::Receiver<bool>>) -> bool {
 }
 
 /// Reads what other gateways hear, if there may be any.
-async fn follow(parts: &Components, board: Arc<LiveBoard<Live>>) {
+async fn follow(parts: &Components, board: Arc<LiveBoard<NewestHeartbeat>>) {
     match parts.heard.clone() {
         Some(heard) => midshift_store::follow_heartbeats(heard, board, parts.clock.clone()).await,
         None => std::future::pending().await,

@@ -9,7 +9,7 @@
 use crate::{Error, LiveBoard, Store};
 use async_trait::async_trait;
 use midshift_core::Boxed;
-use midshift_core::heartbeat::{Live, SharedHeartbeat};
+use midshift_core::heartbeat::{NewestHeartbeat, SharedHeartbeat};
 use midshift_core::ids::RobotId;
 use midshift_core::rows::Seq;
 use midshift_core::time::Clock;
@@ -53,8 +53,8 @@ pub trait HeartbeatLog: Send + Sync + 'static {
     async fn read(&self, after: u64) -> Result<(Vec<StoredHeartbeat>, u64), Error>;
 }
 
-impl From<&Live> for StoredHeartbeat {
-    fn from(live: &Live) -> Self {
+impl From<&NewestHeartbeat> for StoredHeartbeat {
+    fn from(live: &NewestHeartbeat) -> Self {
         let (session_epoch, hb) = (live.report.session_epoch, live.report.hb);
         Self { robot_id: live.robot_id.clone(), session_epoch, hb, body: SharedHeartbeat::from(live).text() }
     }
@@ -64,7 +64,7 @@ impl From<&Live> for StoredHeartbeat {
 /// never before its gateway had it. What was heard before this began is passed over: whoever is there is heard again within a second.
 pub fn follow_heartbeats(
     log: Arc<dyn HeartbeatLog>,
-    board: Arc<LiveBoard<Live>>,
+    board: Arc<LiveBoard<NewestHeartbeat>>,
     clock: Arc<dyn Clock>,
 ) -> Boxed<'static, ()> {
     Box::pin(async move {
@@ -85,7 +85,7 @@ pub fn follow_heartbeats(
 async fn read_newest(
     log: &dyn HeartbeatLog,
     after: Option<u64>,
-    board: &LiveBoard<Live>,
+    board: &LiveBoard<NewestHeartbeat>,
     clock: &dyn Clock,
 ) -> Result<u64, Error> {
     let Some(after) = after else { return log.position().await };
@@ -95,7 +95,7 @@ async fn read_newest(
         match SharedHeartbeat::parse(&one.body) {
             Ok(shared) => {
                 let before = board.get(&one.robot_id);
-                if let Some(live) = shared.into_live(&one.robot_id, before.as_deref(), now) {
+                if let Some(live) = shared.into_newest(&one.robot_id, before.as_deref(), now) {
                     board.publish(&one.robot_id, Arc::new(live));
                 }
             }

@@ -2,7 +2,7 @@
 
 use crate::TelemetryService;
 use crate::inner::Inner;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
@@ -76,7 +76,7 @@ fn filter(wire: Option<v1::RobotFilter>, by: Caller, bad: &mut Violations) -> Fi
     Filter { by, robot_ids, robot_id_prefix: wire.robot_id_prefix, presences, labels }
 }
 
-fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&Live>) -> Option<v1::Robot> {
+fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&NewestHeartbeat>) -> Option<v1::Robot> {
     let rows = inner.projection.rows();
     let session = rows.sessions.get(robot_id);
     if session.is_none() && live.is_none() {
@@ -264,7 +264,7 @@ impl Face for TelemetryService {
 struct Watching<'a> {
     inner: &'a Inner,
     filter: Filter,
-    beats: Dirty<Live>,
+    beats: Dirty<NewestHeartbeat>,
     touched: Dirty<()>,
     shown: BTreeSet<RobotId>,
 }

@@ -7,7 +7,7 @@ use crate::misreads::Misreads;
 use crate::projection::LinkProjection;
 use crate::registry::Registry;
 use crate::shared_heartbeats::Shared;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::time::Clock;
 use midshift_store::{FrameLog, HeartbeatLog, LiveBoard, Store};
 use std::sync::Arc;
@@ -21,7 +21,7 @@ pub struct Parts {
     /// Where STATUS is kept.
     pub frames: Arc<dyn FrameLog>,
     /// Newest heartbeats, read by fleet.
-    pub board: Arc<LiveBoard<Live>>,
+    pub board: Arc<LiveBoard<NewestHeartbeat>>,
     /// Where other processes read them, if any may open the store too.
     pub heard: Option<Arc<dyn HeartbeatLog>>,
     /// Where the time of the wall, the link and the site is read.

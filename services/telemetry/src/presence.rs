@@ -4,7 +4,7 @@
 //! newest session writes at once, the others a little later if it has not.
 
 use crate::inner::Inner;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::RobotId;
 use midshift_core::item::{Expect, Item};
 use midshift_core::limits;
@@ -66,7 +66,7 @@ pub async fn write_presence(inner: &Inner) {
 /// Writes what changed; false: the rows must be read again.
 async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: LinkTime) -> bool {
     let now = inner.parts.clock.now();
-    let heard: BTreeMap<RobotId, Arc<Live>> = inner.parts.board.all().into_iter().collect();
+    let heard: BTreeMap<RobotId, Arc<NewestHeartbeat>> = inner.parts.board.all().into_iter().collect();
     // After a start nobody is called offline before the time that it takes to come back.
     let young = now.link.since(started) <= limits::OFFLINE_AFTER;
     let robots: Vec<RobotId> =
@@ -110,7 +110,7 @@ async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: Lin
 }
 
 /// Whether a heartbeat says what the row does not: something else keeps the robot from work, or what was kept of it is old.
-fn is_news(row: &PresenceRow, live: &Live) -> bool {
+fn is_news(row: &PresenceRow, live: &NewestHeartbeat) -> bool {
     let is_old = row.last_heard.as_ref().is_none_or(|last| {
         Utc(live.received_unix_ms).ms_since(Utc(last.at_unix_ms)) >= limits::LAST_HEARD_EVERY.as_ms()
     });

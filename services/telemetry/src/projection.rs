@@ -5,7 +5,7 @@
 use crate::stops::SiteStops;
 use midshift_core::desired_state::{DesiredPolicy, DesiredWork};
 use midshift_core::fleet::rows::RobotControl;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::{AreaId, RobotId, WaypointId};
 use midshift_core::presence::PresenceRow;
 use midshift_core::rows::Seq;
@@ -53,7 +53,7 @@ impl Rows {
         RobotControl::label(self.control.get(robot_id), &self.sessions.get(robot_id)?.inventory, key)
     }
     /// The area in which a robot is by its newest heartbeat; none: not known.
-    pub fn area_of(&self, live: Option<&Live>) -> Option<&AreaId> {
+    pub fn area_of(&self, live: Option<&NewestHeartbeat>) -> Option<&AreaId> {
         live?.area(self.site.as_ref()?)
     }
     /// The area in which a waypoint lies; none: not known.

@@ -18,7 +18,7 @@ use crate::stops::StopNews;
 use crate::waits::{finish, is_cut_off, next_replay, sleep_until, until_over};
 use crate::welcome::Begun;
 use midshift_core::fleet::REPORT_TOO_LONG;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::RobotId;
 use midshift_core::item::{Fact, Item};
 use midshift_core::limits;
@@ -358,7 +358,7 @@ impl Session {
         metrics::counter!("midshift_telemetry_heartbeats_total").increment(1);
         let Some(in_charge) = &self.in_charge else { return };
         in_charge.note_heard(now.link);
-        let live = Live {
+        let live = NewestHeartbeat {
             robot_id: self.robot_id.clone(),
             report,
             processed_at: now.link,

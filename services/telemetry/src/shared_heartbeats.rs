@@ -5,7 +5,7 @@
 //! reach the database extends no authority; when that lasts, its sessions end and its robots go to another.
 
 use crate::projection::LinkProjection;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::RobotId;
 use midshift_store::{HeartbeatLog, LiveBoard, SavedHeartbeats, StoredHeartbeat};
 use std::collections::BTreeMap;
@@ -39,7 +39,7 @@ pub enum News {
 /// A heartbeat on its way, and who waits for what becomes of it.
 #[derive(Debug)]
 struct Waiting {
-    live: Arc<Live>,
+    live: Arc<NewestHeartbeat>,
     session: mpsc::Sender<News>,
 }
 
@@ -58,7 +58,7 @@ impl Shared {
         Self { log, waiting, queue: Mutex::new(Some(queue)), cut_off: watch::Sender::new(false) }
     }
     /// Takes a heartbeat; `session` hears what becomes of it, or nothing.
-    pub fn queue(&self, live: Arc<Live>, session: &mpsc::Sender<News>) {
+    pub fn queue(&self, live: Arc<NewestHeartbeat>, session: &mpsc::Sender<News>) {
         if self.waiting.try_send(Waiting { live, session: session.clone() }).is_err() {
             metrics::counter!("midshift_telemetry_heartbeats_dropped_total").increment(1);
         }
@@ -70,7 +70,7 @@ impl Shared {
 }
 
 /// Keeps heartbeats until it is dropped.
-pub async fn keep_heartbeats(shared: Option<&Shared>, board: &LiveBoard<Live>, projection: &LinkProjection) {
+pub async fn keep_heartbeats(shared: Option<&Shared>, board: &LiveBoard<NewestHeartbeat>, projection: &LinkProjection) {
     let queue = |shared: &Shared| shared.queue.lock().unwrap_or_else(PoisonError::into_inner).take();
     let Some((shared, mut queue)) = shared.and_then(|s| Some((s, queue(s)?))) else {
         return std::future::pending().await;
@@ -135,7 +135,7 @@ async fn write(
 
 /// Puts what was kept on the board and tells its sessions, once what had been decided before has come down to them.
 async fn publish_saved(
-    board: &LiveBoard<Live>,
+    board: &LiveBoard<NewestHeartbeat>,
     projection: &LinkProjection,
     batch: BTreeMap<RobotId, Waiting>,
     saved: &SavedHeartbeats,

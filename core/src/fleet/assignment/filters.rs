@@ -11,7 +11,7 @@ use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::eligibility::{another_could, decided_by_people, fits, reported};
 use crate::fleet::tasks::{claims, load, plausible};
 use crate::fleet::traffic::{engaged_stops, routing};
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{RobotId, Subject};
 use crate::limits;
 use crate::presence::Presence;
@@ -129,7 +129,7 @@ fn prefer_others(
 }
 
 /// A robot that refused this task is asked again only once it has said something newer.
-fn just_refused(view: &FleetProjection, live: &Live, task: &TaskState) -> Result<(), Reason> {
+fn just_refused(view: &FleetProjection, live: &NewestHeartbeat, task: &TaskState) -> Result<(), Reason> {
     let last = task.attempt_id().and_then(|id| view.attempt(&id)).filter(|a| a.robot_id == live.robot_id);
     match last {
         Some(a)
@@ -146,7 +146,7 @@ fn just_refused(view: &FleetProjection, live: &Live, task: &TaskState) -> Result
 /// Where the robot stands, and the goals that are left.
 fn journey(
     view: &FleetProjection,
-    live: &Live,
+    live: &NewestHeartbeat,
     task: &TaskState,
     intake: &TaskIntake,
 ) -> Result<(WaypointIx, Vec<WaypointIx>), Reason> {
@@ -176,7 +176,7 @@ fn place(view: &FleetProjection, here: WaypointIx, goals: &[WaypointIx]) -> Resu
 /// no charger can be reached. A site without chargers has no way home.
 fn energy(
     view: &FleetProjection,
-    live: &Live,
+    live: &NewestHeartbeat,
     here: WaypointIx,
     last: WaypointIx,
     mut trip: Trip,

@@ -11,7 +11,7 @@ use crate::fleet::decision::plan::Plan;
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::eligibility;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::presence::Presence;
@@ -40,7 +40,7 @@ fn breaker(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> {
 }
 
 /// How long something lasts before people are told of it, where the robot is.
-fn patience(view: &FleetProjection, live: Option<&Live>) -> LinkDuration {
+fn patience(view: &FleetProjection, live: Option<&NewestHeartbeat>) -> LinkDuration {
     let area = live.and_then(|live| live.area(&view.site));
     area.map_or(limits::LASTS_BEFORE_INCIDENT, |area| LinkDuration(view.policy(area).incident_after_ms))
 }

@@ -15,7 +15,7 @@ use crate::fleet::projection::rows::{Place, RobotHolder};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::{claims, eligibility, plausible};
 use crate::fleet::traffic::{closed_places, engaged_stops, grants, route_requests, starts};
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{PlaceId, RobotId};
 use crate::presence::Presence;
 use crate::reason::{Code, Reason};
@@ -135,7 +135,7 @@ fn explain_let_go(view: &FleetProjection, a: &Attempt) -> Reason {
 }
 
 /// The robot works on this step of the attempt.
-fn works(view: &FleetProjection, now: &Now, a: &Attempt, live: &Live, step: u32) -> Reason {
+fn works(view: &FleetProjection, now: &Now, a: &Attempt, live: &NewestHeartbeat, step: u32) -> Reason {
     let robot_id = &a.robot_id;
     let since = Utc(now.utc.0 - i64::try_from(now.site.since(live.progress_at).as_ms()).unwrap_or(0));
     let since = a.accepted.map_or(since, |accepted| since.max(accepted));
@@ -147,7 +147,7 @@ fn works(view: &FleetProjection, now: &Now, a: &Attempt, live: &Live, step: u32)
 }
 
 /// The attempt is UNCERTAIN.
-fn unknown(a: &Attempt, live: Option<&std::sync::Arc<Live>>) -> Option<Reason> {
+fn unknown(a: &Attempt, live: Option<&std::sync::Arc<NewestHeartbeat>>) -> Option<Reason> {
     let (robot_id, uncertain) = (&a.robot_id, a.uncertain.as_ref()?);
     let is_manual = live.is_some_and(|live| live.report.mode != Mode::Automatic);
     let (what, way_out) = match uncertain.cause.code {

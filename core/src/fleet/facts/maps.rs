@@ -9,7 +9,7 @@ use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::rows::Place;
 use crate::fleet::projection::state::FleetProjection;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{PlaceId, RobotId, TaskId, WaypointId};
 use crate::reason::{Code, Reason};
 use crate::site::{Site, WaypointIx, read_stored};
@@ -132,14 +132,14 @@ fn holds(stored: &Site, new: &Site, row: &Place) -> bool {
 }
 
 /// The robot says that it drives by another map than the one that is planned on.
-pub fn differs(view: &FleetProjection, live: &Live) -> Option<Reason> {
+pub fn differs(view: &FleetProjection, live: &NewestHeartbeat) -> Option<Reason> {
     let (own, ours) = (&live.report.map_version, view.site.map_version());
     let reason = || Reason::from(Code::MapDiffers).with("robot_map", own).with("map_version", ours);
     (!own.is_empty() && own != ours).then(reason)
 }
 
 /// Opens the incident of a robot with another map, and closes it once it has ours.
-pub(in crate::fleet) fn compare(tx: &mut Tx, live: &Live) {
+pub(in crate::fleet) fn compare(tx: &mut Tx, live: &NewestHeartbeat) {
     let id = format!("{}:{}", Code::MapDiffers, live.robot_id);
     let open = tx.view.incidents.get(&id).map(|i| &i.row).filter(|i| i.closed.is_none());
     match (differs(tx.view, live), open.map(|i| &i.reason)) {

@@ -14,7 +14,7 @@ use crate::fleet::tasks::claims::{PLACES, differences, excess, implausible};
 use crate::fleet::tasks::transitions::{self, News, apply_event, may_suspend};
 use crate::fleet::tasks::{arrivals, errand_reports, load, plausible};
 use crate::fleet::traffic::{route_requests, routing};
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
 use crate::presence::Presence;
@@ -68,7 +68,7 @@ pub fn repair_robot(view: &mut FleetProjection, now: Now, robot_id: &RobotId, bo
 }
 
 /// Compares the rows with a heartbeat, if its differences count.
-fn compare_heartbeat(view: &mut FleetProjection, now: Now, live: &Live, tally: &mut Tally, plan: &mut Plan) {
+fn compare_heartbeat(view: &mut FleetProjection, now: Now, live: &NewestHeartbeat, tally: &mut Tally, plan: &mut Plan) {
     if !is_settled(view, live) || !is_fresh(view, live) {
         tally.pending += 1;
         return;
@@ -96,7 +96,7 @@ fn compare_heartbeat(view: &mut FleetProjection, now: Now, live: &Live, tally: &
 }
 
 /// Suspends the task of a robot that must charge: a preemptible one that it has not opened, at a step boundary.
-fn suspend_to_charge(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+fn suspend_to_charge(tx: &mut Tx, robot_id: &RobotId, live: &NewestHeartbeat) {
     let Some(task_id) = tx.view.held_by(robot_id).and_then(|id| id.subject.task_id()).cloned() else { return };
     let vitals = &live.report.vitals;
     if !may_suspend(tx.view, &task_id, live) || tx.view.site.chargers().next().is_none() {
@@ -151,7 +151,7 @@ fn end_lease(tx: &mut Tx, robot_id: &RobotId, tally: &mut Tally) {
 }
 
 /// Repairs the attempt that holds a robot from the attempts that the robot lists.
-fn repair_attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tally) {
+fn repair_attempt(tx: &mut Tx, robot_id: &RobotId, live: &NewestHeartbeat, tally: &mut Tally) {
     let Some(id) = tx.view.held_by(robot_id).cloned() else { return };
     let Some(a) = tx.view.attempt(&id).cloned() else { return };
     let listed = live.report.attempts.iter().find(|r| r.attempt == id);
@@ -204,7 +204,7 @@ fn repair_attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live, tally: &mut Tall
 }
 
 /// The robot heard the offer and lists no answer: the offer stands, or was taken back only because nobody answered it.
-fn is_unanswered(view: &FleetProjection, a: &Attempt, live: &Live) -> bool {
+fn is_unanswered(view: &FleetProjection, a: &Attempt, live: &NewestHeartbeat) -> bool {
     let task = a.attempt.subject.task_id().and_then(|id| view.task(id));
     let ran_out = task.and_then(|t| t.reason.as_ref()).is_some_and(|r| r.code == Code::OfferNotAnswered);
     let waits = a.phase == AttemptPhase::Offered || (a.phase == AttemptPhase::Stopping && ran_out);
@@ -214,7 +214,7 @@ fn is_unanswered(view: &FleetProjection, a: &Attempt, live: &Live) -> bool {
 }
 
 /// Notes an attempt that a robot lists and no row knows. If the robot keeps it, an incident is opened.
-fn note_unknown_attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+fn note_unknown_attempt(tx: &mut Tx, robot_id: &RobotId, live: &NewestHeartbeat) {
     forget_disowned(tx, robot_id, live);
     let Some(attempt) = unknown_attempt(tx.view, live).cloned() else {
         tx.view.unknown.remove(robot_id);
@@ -232,7 +232,7 @@ fn note_unknown_attempt(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
 }
 
 /// The first attempt that a robot lists as its own and that does not hold it; what a person disowned does not count.
-pub fn unknown_attempt<'l>(view: &FleetProjection, live: &'l Live) -> Option<&'l AttemptId> {
+pub fn unknown_attempt<'l>(view: &FleetProjection, live: &'l NewestHeartbeat) -> Option<&'l AttemptId> {
     let holder = view.held_by(&live.robot_id);
     let disowned = view.control.get(live.robot_id.as_str()).map(|c| c.row.disowned.as_slice()).unwrap_or_default();
     let mine = live.report.attempts.iter().filter(|r| !r.state.is_over()).map(|r| &r.attempt);
@@ -240,7 +240,7 @@ pub fn unknown_attempt<'l>(view: &FleetProjection, live: &'l Live) -> Option<&'l
 }
 
 /// What the robot has let go is known to nobody any more.
-fn forget_disowned(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+fn forget_disowned(tx: &mut Tx, robot_id: &RobotId, live: &NewestHeartbeat) {
     let Some(control) = tx.view.control.get(robot_id.as_str()).map(|c| &c.row) else { return };
     let is_listed = |id: &AttemptId| live.report.attempts.iter().any(|r| r.attempt == *id);
     if control.disowned.iter().all(is_listed) {
@@ -252,12 +252,12 @@ fn forget_disowned(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
 }
 
 /// A robot in automatic mode lists an attempt that the record has as unanswered or UNCERTAIN.
-fn needs_sight(a: &Attempt, live: &Live) -> bool {
+fn needs_sight(a: &Attempt, live: &NewestHeartbeat) -> bool {
     live.report.mode == Mode::Automatic && (a.uncertain.is_some() || a.phase == AttemptPhase::Offered)
 }
 
 /// Attempts that are over for both may leave the robot's list.
-fn forget_reported(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+fn forget_reported(tx: &mut Tx, robot_id: &RobotId, live: &NewestHeartbeat) {
     let over = live.report.attempts.iter().filter(|r| r.state.is_over() || r.state == WorkState::StepUnknown);
     let closed = tx.view.desired_work.get(robot_id.as_str()).map(|d| d.row.closed.clone()).unwrap_or_default();
     let holder = tx.view.held_by(robot_id);
@@ -267,7 +267,7 @@ fn forget_reported(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
 }
 
 /// Fires the event of a stall if a robot at work has reported no progress for longer than its task allows.
-fn detect_stall(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
+fn detect_stall(tx: &mut Tx, robot_id: &RobotId, live: &NewestHeartbeat) {
     let Some(task_id) = tx.view.held_by(robot_id).and_then(|a| a.subject.task_id().cloned()) else { return };
     let Some(task) = tx.view.task(&task_id) else { return };
     let Some(intake) = tx.view.intake(&task_id) else { return };
@@ -293,7 +293,7 @@ fn detect_stall(tx: &mut Tx, robot_id: &RobotId, live: &Live) {
 }
 
 /// Brings place rows to what a settled robot reports: entered, gone, or standing somewhere nobody knew of. What is not `sound` frees nothing.
-fn repair_places(view: &mut FleetProjection, now: Now, live: &Live, sound: bool, plan: &mut Plan) {
+fn repair_places(view: &mut FleetProjection, now: Now, live: &NewestHeartbeat, sound: bool, plan: &mut Plan) {
     let robot_id = &live.robot_id;
     let excess = excess(view, live);
     let mut changes = differences(view, live);

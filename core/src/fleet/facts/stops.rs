@@ -10,7 +10,7 @@ use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{HoldToken, RobotControl};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::traffic::engaged_stops::{self, over};
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{RobotId, StopId};
 use crate::limits;
 use crate::presence::Presence;
@@ -90,7 +90,7 @@ fn open_incidents(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
 }
 
 /// Puts one robot's tokens right, as many as one item takes; `live` only while it is heard. False: there are more.
-fn correct_tokens(tx: &mut Tx, robot_id: &RobotId, live: Option<&Live>) -> bool {
+fn correct_tokens(tx: &mut Tx, robot_id: &RobotId, live: Option<&NewestHeartbeat>) -> bool {
     let (waits, engaged): (BTreeSet<StopId>, BTreeSet<StopId>) = match live.map(|live| &live.report) {
         Some(r) => (r.awaiting_resume.iter().cloned().collect(), r.stops.iter().cloned().collect()),
         None => Default::default(),

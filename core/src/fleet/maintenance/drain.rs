@@ -13,7 +13,7 @@ use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::transitions::{self, News};
 use crate::fleet::tasks::{eligibility, errand_reports, load};
 use crate::fleet::traffic::routing;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{DrainId, RobotId};
 use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::reason::{Code, Reason};
@@ -170,7 +170,7 @@ fn further(tx: &mut Tx, drain: &Drain, board: &Board) {
 }
 
 /// Milliseconds of site time that the rest of a task will take, as far as one can tell.
-fn rest_ms(view: &FleetProjection, task_id: &crate::ids::TaskId, live: &Live) -> u64 {
+fn rest_ms(view: &FleetProjection, task_id: &crate::ids::TaskId, live: &NewestHeartbeat) -> u64 {
     let Some((task, intake)) = view.task(task_id).zip(view.intake(task_id)) else { return 0 };
     let done = live.report.attempts.iter().map(|a| a.step_index).max().unwrap_or(task.next_step) as usize;
     let steps = &intake.spec.steps;
@@ -185,7 +185,7 @@ fn rest_ms(view: &FleetProjection, task_id: &crate::ids::TaskId, live: &Live) ->
 }
 
 /// The robot stands where it may stand for long, and what it says is newer than what it last did. One that was never heard rests too.
-fn is_at_rest(view: &FleetProjection, drain: &Drain, live: Option<&Live>) -> bool {
+fn is_at_rest(view: &FleetProjection, drain: &Drain, live: Option<&NewestHeartbeat>) -> bool {
     let Some(live) = live else { return true };
     let Some(here) = routing::find(view, live.report.vitals.waypoint.as_ref()) else { return false };
     let idle = live.report.attempts.iter().all(|a| a.state.is_over()) && live.report.vitals.speed_mm_s == 0;
@@ -202,7 +202,7 @@ fn may_rest(view: &FleetProjection, robot_id: &RobotId, here: WaypointIx) -> boo
     holds && matches!(view.site.waypoint(here).kind, Kind::Park | Kind::Hold | Kind::Charger)
 }
 
-fn park(tx: &mut Tx, drain: &Drain, live: &Live, board: &Board) {
+fn park(tx: &mut Tx, drain: &Drain, live: &NewestHeartbeat, board: &Board) {
     let quiet = live.report.attempts.iter().all(|a| a.state.is_over()) && liveness::is_settled(tx.view, live);
     // With a standing fault, stopped or driven by hand it would only fail: the deadline goes on.
     let unwilling = tx.view.unwilling.get(&drain.robot_id).is_some_and(|until| tx.now.link < *until)

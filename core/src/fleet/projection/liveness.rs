@@ -1,7 +1,7 @@
 //! Whether a robot is heard, and whether what it says may be compared with the rows. Reads only; called by every room that acts on a heartbeat.
 
 use super::state::FleetProjection;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::presence::Presence;
@@ -25,7 +25,7 @@ pub fn lease_stands(view: &FleetProjection, board: &Board, robot_id: &RobotId, n
 }
 
 /// The robot's differences count: it has applied everything and everything it said has been consumed.
-pub fn is_settled(view: &FleetProjection, live: &Live) -> bool {
+pub fn is_settled(view: &FleetProjection, live: &NewestHeartbeat) -> bool {
     let id = live.robot_id.as_str();
     let Some(session) = view.sessions.get(id) else { return false };
     let current = session.row.session_epoch == live.report.session_epoch;
@@ -35,7 +35,7 @@ pub fn is_settled(view: &FleetProjection, live: &Live) -> bool {
 }
 
 /// The heartbeat is not older than the robot's events that were consumed: an older one lists what has ended since.
-pub fn is_fresh(view: &FleetProjection, live: &Live) -> bool {
+pub fn is_fresh(view: &FleetProjection, live: &NewestHeartbeat) -> bool {
     let id = live.robot_id.as_str();
     let Some(session) = view.sessions.get(id) else { return false };
     let mark = view.lane_marks.get(&format!("{id}/{}", session.row.ring)).map_or(0, |m| m.row.event);
@@ -43,4 +43,4 @@ pub fn is_fresh(view: &FleetProjection, live: &Live) -> bool {
 }
 
 /// The newest heartbeat of every robot.
-pub type Board = BTreeMap<RobotId, Arc<Live>>;
+pub type Board = BTreeMap<RobotId, Arc<NewestHeartbeat>>;

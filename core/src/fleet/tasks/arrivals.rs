@@ -17,7 +17,7 @@ use super::{claims, plausible};
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::rows::HolderState;
 use crate::fleet::projection::state::FleetProjection;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AttemptId, PlaceId, RobotId};
 use crate::robot::WorkState;
 use crate::robot_events::AttemptReport;
@@ -45,7 +45,7 @@ pub fn note_left(tx: &mut Tx, robot_id: &RobotId, place_id: &PlaceId) {
 }
 
 /// Takes from a heartbeat at which waypoint the robot is.
-pub fn note_standing(tx: &mut Tx, live: &Live) {
+pub fn note_standing(tx: &mut Tx, live: &NewestHeartbeat) {
     let site = tx.view.site.clone();
     let at = live.report.vitals.waypoint.as_ref().and_then(|waypoint| site.find(waypoint));
     let Some(place) = at.and_then(|at| site.standing_at(at)) else { return };

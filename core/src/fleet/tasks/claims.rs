@@ -15,7 +15,7 @@ use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::{HolderState, Incident, Place, PlaceHolder};
 use crate::fleet::projection::state::{self, FleetProjection};
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{PlaceId, RobotId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -31,7 +31,7 @@ pub(in crate::fleet) const PLACES: &str = "places";
 pub(in crate::fleet) type Difference = (PlaceId, u64, PlaceNews);
 
 /// What a settled robot says of places that the rows do not; what is near its pose comes before what is not.
-pub(in crate::fleet) fn differences(view: &FleetProjection, live: &Live) -> Vec<Difference> {
+pub(in crate::fleet) fn differences(view: &FleetProjection, live: &NewestHeartbeat) -> Vec<Difference> {
     let robot_id = &live.robot_id;
     let standing_on = live.report.vitals.waypoint.as_ref().filter(|_| live.report.vitals.speed_mm_s == 0);
     let mut changes = Vec::new();
@@ -67,16 +67,16 @@ pub(in crate::fleet) fn differences(view: &FleetProjection, live: &Live) -> Vec<
 }
 
 /// Whether the robot's pose lies in the place or near it.
-fn is_near(view: &FleetProjection, live: &Live, place_id: &PlaceId) -> bool {
+fn is_near(view: &FleetProjection, live: &NewestHeartbeat, place_id: &PlaceId) -> bool {
     is_within(view, live, place_id, limits::CLAIMED_PLACE_MARGIN_MM)
 }
 
 /// Whether the robot's pose lies in the place.
-fn lies_inside(view: &FleetProjection, live: &Live, place_id: &PlaceId) -> bool {
+fn lies_inside(view: &FleetProjection, live: &NewestHeartbeat, place_id: &PlaceId) -> bool {
     is_within(view, live, place_id, 0)
 }
 
-fn is_within(view: &FleetProjection, live: &Live, place_id: &PlaceId, margin_mm: i32) -> bool {
+fn is_within(view: &FleetProjection, live: &NewestHeartbeat, place_id: &PlaceId, margin_mm: i32) -> bool {
     let Some(pose) = &live.report.vitals.pose else { return false };
     Region::of_zone(&view.site, place_id).is_some_and(|region| region.is_near(pose, margin_mm))
 }
@@ -97,7 +97,7 @@ fn taken_over(view: &FleetProjection, robot_id: &RobotId) -> usize {
 }
 
 /// The robot says that it is inside of more places without a grant than it can be, and no person has looked at that.
-pub fn too_many(view: &FleetProjection, live: &Live) -> Option<Reason> {
+pub fn too_many(view: &FleetProjection, live: &NewestHeartbeat) -> Option<Reason> {
     excess(view, live).map(|_| implausible())
 }
 
@@ -106,7 +106,7 @@ pub(in crate::fleet) fn implausible() -> Reason {
 }
 
 /// Places without a grant that the robot says it is inside of, if they are more than it can be inside of and no person has looked at that.
-pub(in crate::fleet) fn excess<'l>(view: &FleetProjection, live: &'l Live) -> Option<BTreeSet<&'l str>> {
+pub(in crate::fleet) fn excess<'l>(view: &FleetProjection, live: &'l NewestHeartbeat) -> Option<BTreeSet<&'l str>> {
     let robot_id = &live.robot_id;
     let is_claim = |id: &PlaceId| {
         let place = view.places.get(id.as_str()).map(|place| &place.row);

@@ -6,7 +6,7 @@ use super::load;
 use crate::fleet::decision::slice::Slice;
 use crate::fleet::projection::rows::RobotControl;
 use crate::fleet::projection::state::FleetProjection;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
 use crate::robot::{Duty, FaultClass, HardwareStop, Mode, StopLevel};
@@ -18,7 +18,7 @@ use std::collections::BTreeMap;
 pub(in crate::fleet) fn decided_by_people(
     view: &FleetProjection,
     robot_id: &RobotId,
-    live: Option<&Live>,
+    live: Option<&NewestHeartbeat>,
 ) -> Result<(), Reason> {
     if let Some(control) = view.control.get(robot_id.as_str()).map(|c| &c.row) {
         match control.duty() {
@@ -43,7 +43,7 @@ pub(in crate::fleet) fn decided_by_people(
 }
 
 /// What a robot says of itself that keeps it from work.
-pub(in crate::fleet) fn reported(live: &Live) -> Result<(), Reason> {
+pub(in crate::fleet) fn reported(live: &NewestHeartbeat) -> Result<(), Reason> {
     let r = &live.report;
     if r.mode != Mode::Automatic {
         return Err(Code::RobotManual.into());

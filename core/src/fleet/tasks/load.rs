@@ -13,7 +13,7 @@ use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{Drain, DrainState, LoadSettled, RobotControl};
 use crate::fleet::projection::state::FleetProjection;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::RobotId;
 use crate::presence::Presence;
 use crate::reason::{Code, Kind, Reason, Refusal};
@@ -23,14 +23,18 @@ use crate::task::{Phase, TaskIntake, TaskState};
 use crate::time::Now;
 
 /// What a robot carries by its newest heartbeat, unless a person has said since, while it was not heard, that it carries nothing.
-pub fn carried<'l>(view: &FleetProjection, live: &'l Live) -> Option<&'l Load> {
+pub fn carried<'l>(view: &FleetProjection, live: &'l NewestHeartbeat) -> Option<&'l Load> {
     live.report.load.as_ref().filter(|_| settled(view, &live.robot_id, Some(live)).is_none())
 }
 
 /// A person's word that holds: the robot was not heard then, and has said nothing newer.
-fn settled<'v>(view: &'v FleetProjection, robot_id: &RobotId, live: Option<&Live>) -> Option<&'v LoadSettled> {
+fn settled<'v>(
+    view: &'v FleetProjection,
+    robot_id: &RobotId,
+    live: Option<&NewestHeartbeat>,
+) -> Option<&'v LoadSettled> {
     let word = view.control.get(robot_id.as_str())?.row.load_settled.as_ref().filter(|word| !word.is_forget_pending)?;
-    let is_newer = |live: &Live| (live.report.session_epoch, live.report.hb) > (word.session_epoch, word.hb);
+    let is_newer = |live: &NewestHeartbeat| (live.report.session_epoch, live.report.hb) > (word.session_epoch, word.hb);
     (!live.is_some_and(is_newer)).then_some(word)
 }
 
@@ -38,7 +42,7 @@ fn settled<'v>(view: &'v FleetProjection, robot_id: &RobotId, live: Option<&Live
 pub fn standing_word<'v>(
     view: &'v FleetProjection,
     robot_id: &RobotId,
-    live: Option<&Live>,
+    live: Option<&NewestHeartbeat>,
 ) -> Option<&'v LoadSettled> {
     let told = || view.control.get(robot_id.as_str())?.row.load_settled.as_ref().filter(|word| word.is_forget_pending);
     settled(view, robot_id, live).or_else(told)
@@ -50,7 +54,7 @@ fn is_by_memory(view: &FleetProjection, robot_id: &RobotId) -> bool {
 }
 
 /// A person's word as the robot is told it: while it says by memory, in the session of that word, that it carries something.
-pub(in crate::fleet) fn word_for(view: &FleetProjection, live: &Live) -> Option<LoadWord> {
+pub(in crate::fleet) fn word_for(view: &FleetProjection, live: &NewestHeartbeat) -> Option<LoadWord> {
     let report = &live.report;
     let word = view.control.get(live.robot_id.as_str())?.row.load_settled.as_ref()?;
     let is_older = word.session_epoch == report.session_epoch && word.hb <= report.hb;
@@ -59,7 +63,7 @@ pub(in crate::fleet) fn word_for(view: &FleetProjection, live: &Live) -> Option<
 }
 
 /// Ends a person's word that the robot's own has overtaken: it carries nothing any more, or speaks in another session.
-pub(in crate::fleet) fn end_word(tx: &mut Tx, live: &Live) {
+pub(in crate::fleet) fn end_word(tx: &mut Tx, live: &NewestHeartbeat) {
     let Some(control) = tx.view.control.get(live.robot_id.as_str()).map(|control| &control.row) else { return };
     let Some(word) = &control.load_settled else { return };
     let (session_epoch, hb) = (live.report.session_epoch, live.report.hb);
@@ -140,13 +144,13 @@ pub(in crate::fleet) fn settle(tx: &Tx, board: &Board, robot_id: &RobotId, reaso
 
 /// The robot carries something that it is not taken with: software changes only on an empty robot, unless it goes back to what it kept.
 /// With a person's drain somebody comes to it, who waits only for a task that goes on.
-pub fn must_deliver(view: &FleetProjection, drain: &Drain, live: Option<&Live>) -> bool {
+pub fn must_deliver(view: &FleetProjection, drain: &Drain, live: Option<&NewestHeartbeat>) -> bool {
     let loaded = live.is_some_and(|live| carried(view, live).is_some());
     loaded && !drain.is_way_back && (!drain.is_of_person() || goes_on(view, live))
 }
 
 /// The task whose item the robot carries is tried again by itself, on this robot.
-pub fn goes_on(view: &FleetProjection, live: Option<&Live>) -> bool {
+pub fn goes_on(view: &FleetProjection, live: Option<&NewestHeartbeat>) -> bool {
     let Some(live) = live else { return false };
     let task_id = carried(view, live).and_then(|load| load.task_id.as_ref());
     task_id.and_then(|id| view.task(id)).is_some_and(|task| {
@@ -156,6 +160,6 @@ pub fn goes_on(view: &FleetProjection, live: Option<&Live>) -> bool {
 }
 
 /// Whether a robot that drains may be given work all the same: of the task whose item it carries, and of no other.
-pub fn may_end_its_task(view: &FleetProjection, drain: &Drain, live: &Live) -> bool {
+pub fn may_end_its_task(view: &FleetProjection, drain: &Drain, live: &NewestHeartbeat) -> bool {
     drain.state == DrainState::Draining && must_deliver(view, drain, Some(live)) && goes_on(view, Some(live))
 }

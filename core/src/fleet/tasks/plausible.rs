@@ -11,7 +11,7 @@
 use super::{attempts, claims};
 use crate::fleet::projection::liveness;
 use crate::fleet::projection::state::FleetProjection;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AttemptId, RobotId};
 use crate::reason::{Code, Reason};
 use crate::robot::WorkState;
@@ -90,7 +90,7 @@ pub fn judge(
 }
 
 /// The first attempt that a heartbeat lists in a way that cannot be. One that is older than the robot's events tells nothing.
-pub fn doubtful(view: &FleetProjection, live: &Live) -> Option<(AttemptId, Reason)> {
+pub fn doubtful(view: &FleetProjection, live: &NewestHeartbeat) -> Option<(AttemptId, Reason)> {
     if !liveness::is_fresh(view, live) {
         return None;
     }
@@ -106,7 +106,7 @@ pub fn doubtful(view: &FleetProjection, live: &Live) -> Option<(AttemptId, Reaso
 ///
 /// # Errors
 /// If so; the reason says what.
-pub fn keeps_back(view: &FleetProjection, live: &Live) -> Result<(), Reason> {
+pub fn keeps_back(view: &FleetProjection, live: &NewestHeartbeat) -> Result<(), Reason> {
     view.unknown_rows.check_robot(&live.robot_id)?;
     view.refused.check_robot(&live.robot_id)?;
     match doubtful(view, live).map(|(_, why)| why).or_else(|| claims::too_many(view, live)) {

@@ -7,7 +7,7 @@ use super::{arrivals, attempts, breaker, eligibility, load, plausible};
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::{HolderState, RobotAuthority, RobotCounter, RobotHolder, Timer, TimerKind};
 use crate::fleet::projection::state::FleetProjection;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -512,7 +512,7 @@ pub fn wants_cancel(task: &TaskState) -> bool {
 }
 
 /// Whether the task may wait for another robot from its next step boundary on: it runs, lets others go first, and is not opened.
-pub fn may_suspend(view: &FleetProjection, task_id: &TaskId, live: &Live) -> bool {
+pub fn may_suspend(view: &FleetProjection, task_id: &TaskId, live: &NewestHeartbeat) -> bool {
     let Some(task) = view.task(task_id).filter(|t| t.phase == Phase::Running && t.opened_robot_id.is_none()) else {
         return false;
     };

@@ -16,7 +16,7 @@ mod unexplained;
 
 use super::projection::{FleetProjection, RevisedRow};
 use super::{Board, Pace, Plan, cycle};
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AttemptId, RobotId, TaskId, WaypointId};
 use crate::item::{Item, Write};
 use crate::reason::Reason;
@@ -63,7 +63,7 @@ impl Rig {
         let session = Session::new(robot_id.clone(), 1, inventory);
         self.view.sessions.insert(session.id(), RevisedRow { revision: Revision(1), row: session });
         let vitals = Vitals { waypoint: WaypointId::parse(waypoint).ok(), battery_permille: 900, ..Vitals::default() };
-        let live = Live {
+        let live = NewestHeartbeat {
             robot_id: robot_id.clone(),
             report: ReportedState { hb: 60, session_epoch: 1, vitals, ..ReportedState::default() },
             processed_at: self.now.link,

@@ -11,7 +11,7 @@ use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::memory::Waiting;
 use crate::fleet::projection::rows::RobotControl;
 use crate::fleet::projection::state::FleetProjection;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::site::PlaceIx;
@@ -33,7 +33,7 @@ pub fn allocate_places(view: &mut FleetProjection, board: &Board, now: Now, plan
     releases
 }
 
-fn allocate(tx: &mut Tx, live: &Live, releases: &mut Releases, occupancy: &mut Occupancy) {
+fn allocate(tx: &mut Tx, live: &NewestHeartbeat, releases: &mut Releases, occupancy: &mut Occupancy) {
     let robot_id = &live.robot_id;
     let Some(a) = tx.view.held_by(robot_id).and_then(|id| tx.view.attempt(id)).cloned() else { return };
     let Some(work) = route_requests::assignment(tx.view, robot_id, &a).cloned() else { return };

@@ -3,7 +3,7 @@
 use crate::authority::Authority;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::state::FleetProjection;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::time::{LinkDuration, Now};
@@ -23,7 +23,7 @@ pub fn anchor(view: &FleetProjection, robot_id: &RobotId, board: &Board, valid: 
 }
 
 /// Less than half of its life is left, or it belongs to another session.
-pub fn is_worn(authority: &Authority, live: Option<&Live>) -> bool {
+pub fn is_worn(authority: &Authority, live: Option<&NewestHeartbeat>) -> bool {
     let Some(live) = live else { return false };
     let age_ms = live.report.hb.saturating_sub(authority.hb).saturating_mul(limits::HEARTBEAT.as_ms());
     authority.session_epoch != live.report.session_epoch || age_ms >= authority.valid_ms / 2

@@ -13,7 +13,7 @@ use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::{HolderState, RobotHolder};
 use crate::fleet::projection::state::{FleetProjection, held};
 use crate::fleet::tasks::{attempts, claims, load};
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AttemptId, RobotId};
 use crate::limits;
 use crate::robot::ReportedAttempt;
@@ -105,7 +105,7 @@ fn assign(
     view: &FleetProjection,
     a: &Attempt,
     old: Option<&Assignment>,
-    live: Option<&Live>,
+    live: Option<&NewestHeartbeat>,
     releases: &Releases,
 ) -> Option<Assignment> {
     let then = a.attempt.subject.task_id().and_then(|t| view.task(t)).and_then(|t| t.then);
@@ -127,7 +127,7 @@ fn assign(
 }
 
 /// A new attempt, with the whole way through all its goals from where the robot is.
-fn begin(view: &FleetProjection, a: &Attempt, live: Option<&Live>) -> Option<Assignment> {
+fn begin(view: &FleetProjection, a: &Attempt, live: Option<&NewestHeartbeat>) -> Option<Assignment> {
     let here = routing::find(view, live.and_then(|l| l.report.vitals.waypoint.as_ref()));
     let (steps, timeout_ms, resume_step, speed) = match a.attempt.subject.task_id() {
         Some(task_id) => {
@@ -205,7 +205,7 @@ fn resume(
 /// Attempts that the robot may forget. One that is over stays until it holds the robot no more: its end is yet to be judged.
 fn closed(
     old: &DesiredWork,
-    live: Option<&Live>,
+    live: Option<&NewestHeartbeat>,
     current: Option<&AttemptId>,
     holder: Option<&AttemptId>,
 ) -> Vec<AttemptId> {

@@ -1,7 +1,7 @@
 //! What the copy of the fleet stops says of now: which robots they keep work from, and which places they close.
 
 use crate::fleet::projection::state::FleetProjection;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
 use crate::robot::StopLevel;
@@ -23,7 +23,7 @@ fn standing(view: &FleetProjection) -> impl Iterator<Item = &Stop> {
 pub(in crate::fleet) fn over<'v>(
     view: &'v FleetProjection,
     robot_id: &'v RobotId,
-    live: Option<&'v Live>,
+    live: Option<&'v NewestHeartbeat>,
 ) -> impl Iterator<Item = &'v Stop> {
     let pose = live.and_then(|live| live.report.vitals.pose.as_ref());
     standing(view).filter(move |stop| stop.includes(robot_id, pose))
@@ -33,7 +33,7 @@ pub(in crate::fleet) fn over<'v>(
 pub(in crate::fleet) fn check_stops(
     view: &FleetProjection,
     robot_id: &RobotId,
-    live: Option<&Live>,
+    live: Option<&NewestHeartbeat>,
 ) -> Result<(), Reason> {
     match over(view, robot_id, live).next() {
         Some(stop) => Err(Reason::from(Code::StopEngaged).with("stop_id", &stop.stop_id).with("scope", &stop.scope)),

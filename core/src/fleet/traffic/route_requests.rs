@@ -9,7 +9,7 @@ use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{HolderState, Place, PlaceHolder};
 use crate::fleet::projection::state::{self, FleetProjection};
 use crate::fleet::tasks::plausible;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{PlaceId, RobotId};
 use crate::presence::Presence;
 use crate::site::route::{Segment, segments};
@@ -75,7 +75,7 @@ fn class_of(view: &FleetProjection, a: &Attempt) -> Class {
 }
 
 /// An accepted attempt of a robot that is heard, not held and not told to stop.
-fn may_drive(view: &FleetProjection, a: &Attempt, live: &Live, board: &Board, now: &Now) -> bool {
+fn may_drive(view: &FleetProjection, a: &Attempt, live: &NewestHeartbeat, board: &Board, now: &Now) -> bool {
     let working = matches!(
         a.phase,
         AttemptPhase::Accepted | AttemptPhase::Navigating | AttemptPhase::Executing | AttemptPhase::Paused
@@ -99,7 +99,7 @@ fn is_released(view: &FleetProjection, robot_id: &RobotId, a: &Attempt) -> bool 
 }
 
 /// The robot stands at the end of what was released to it, and there is more that could be.
-pub fn is_out_of_route(view: &FleetProjection, live: &Live, a: &Attempt) -> bool {
+pub fn is_out_of_route(view: &FleetProjection, live: &NewestHeartbeat, a: &Attempt) -> bool {
     let Some(work) = assignment(view, &live.robot_id, a) else { return false };
     let Some(listed) = live.report.attempts.iter().find(|r| r.attempt == a.attempt) else { return false };
     let released = work.released_index.unwrap_or(0);
@@ -133,7 +133,7 @@ pub(super) fn next_segment(
 
 /// Places on the released stretch ahead that a standing robot does not hold: a passage that its route crosses a second time, or grants that
 /// it lost with its memory. Only a settled, newest report tells.
-pub(super) fn missing(view: &FleetProjection, live: &Live, a: &Attempt) -> Vec<PlaceIx> {
+pub(super) fn missing(view: &FleetProjection, live: &NewestHeartbeat, a: &Attempt) -> Vec<PlaceIx> {
     let standing = live.report.vitals.speed_mm_s == 0;
     let Some(reported) = live.report.attempts.iter().find(|r| r.attempt == a.attempt) else { return Vec::new() };
     let Some(work) = assignment(view, &live.robot_id, a) else { return Vec::new() };

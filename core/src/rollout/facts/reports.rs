@@ -3,7 +3,7 @@
 //! Invariant: what a robot says changes rows only; what follows from it is decided in `robots::due` and `phases`. A
 //! heartbeat counts only once everything the robot had said before it was taken.
 
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{DrainId, RobotId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -134,7 +134,7 @@ fn says_trial(view: &RolloutProjection, robot_id: &RobotId) -> bool {
 }
 
 /// What a settled heartbeat says that the rows do not: the store is older than the robot, or a row was lost.
-pub fn repair(tx: &mut Tx, live: &Live) {
+pub fn repair(tx: &mut Tx, live: &NewestHeartbeat) {
     let robot_id = &live.robot_id;
     let known = tx.view.software_of(robot_id);
     if let Some(report) = &live.report.update
@@ -151,7 +151,7 @@ pub fn repair(tx: &mut Tx, live: &Live) {
 }
 
 /// Whether [`repair`] would change something.
-pub fn is_repair_due(view: &RolloutProjection, live: &Live) -> bool {
+pub fn is_repair_due(view: &RolloutProjection, live: &NewestHeartbeat) -> bool {
     let Some(known) = view.software.get(live.robot_id.as_str()).map(|s| &s.row) else { return true };
     let session = view.sessions.get(live.robot_id.as_str()).map(|s| s.row.inventory.software.as_str());
     let reported = match (&known.report, &live.report.update) {

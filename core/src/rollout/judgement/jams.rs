@@ -7,7 +7,7 @@
 use super::infrastructure::is_open_to;
 use crate::fleet::Board;
 use crate::fleet::liveness;
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::RobotId;
 use crate::limits;
 use crate::presence::Presence;
@@ -42,7 +42,7 @@ fn stood(view: &RolloutProjection, board: &Board, now: &Now, robot_id: &RobotId)
     (has_work && !is_held(live)).then(|| now.site.since(since))
 }
 
-fn is_held(live: &Live) -> bool {
+fn is_held(live: &NewestHeartbeat) -> bool {
     let report = &live.report;
     let by_stop =
         report.stop_level != StopLevel::None || !report.stops.is_empty() || !report.awaiting_resume.is_empty();

@@ -12,7 +12,7 @@ use super::rows::{
 use crate::fleet::Board;
 use crate::fleet::liveness;
 use crate::fleet::rows::{AreaBudget, Drain, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AreaId, DrainId, RobotId, RolloutId};
 use crate::limits;
 use crate::maintenance::{DrainRelease, DrainRequest};
@@ -150,7 +150,7 @@ impl RolloutProjection {
     }
 
     /// A robot was heard.
-    pub fn keep_contact(&mut self, live: &Live) {
+    pub fn keep_contact(&mut self, live: &NewestHeartbeat) {
         let at = live.processed_at;
         let contact = self.contacts.entry(live.robot_id.clone()).or_insert(Contact { since: at, last: at });
         if at.since(contact.last) > limits::OFFLINE_AFTER {
@@ -227,12 +227,12 @@ impl RolloutProjection {
         begun || liveness::presence(board, robot, now) != Presence::Offline
     }
     /// The area in which a robot is.
-    pub fn area_of(&self, live: &Live) -> Option<AreaId> {
+    pub fn area_of(&self, live: &NewestHeartbeat) -> Option<AreaId> {
         live.area(&self.site).cloned()
     }
     /// Everything that the robot had said when it sent this heartbeat was consumed, nothing that it said since, and it
     /// belongs to the newest session.
-    pub fn is_settled(&self, live: &Live) -> bool {
+    pub fn is_settled(&self, live: &NewestHeartbeat) -> bool {
         let id = live.robot_id.as_str();
         let Some(session) = self.sessions.get(id) else { return false };
         let mark = self.lane_marks.get(&format!("{id}/{}", session.row.ring)).map(|m| &m.row);

@@ -35,7 +35,7 @@ use crate::fleet::maintenance::{budget, drain};
 use crate::fleet::rows::{
     DrainState, HolderState, Place, PlaceHolder, RobotAuthority, RobotControl, RobotCounter, RobotHolder,
 };
-use crate::heartbeat::Live;
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId, WaypointId};
 use crate::item::{Expect, Item, Write};
 use crate::maintenance::ReleasedBy;
@@ -387,7 +387,7 @@ impl Rig {
             update: robot.report.clone(),
             ..ReportedState::default()
         };
-        let live = Live {
+        let live = NewestHeartbeat {
             robot_id: robot.id.clone(),
             report,
             processed_at: self.now.link,

@@ -5,7 +5,7 @@
 
 use super::budget::{Judge, Pace, RobotReport, Seen};
 use midshift_core::fleet::rows::Drain;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::{AreaId, RobotId};
 use midshift_core::rollout::rows::{Rollout, RolloutRobot};
 use midshift_core::rows::{BadRow, Seq, Table};
@@ -31,7 +31,7 @@ pub struct Sight {
     /// The store whose rows are read.
     pub store: Arc<dyn Store>,
     /// What robots say.
-    pub board: Arc<LiveBoard<Live>>,
+    pub board: Arc<LiveBoard<NewestHeartbeat>>,
     /// Where they are.
     pub site: Arc<Site>,
     /// The clock that says when it was looked.
@@ -109,7 +109,7 @@ impl Watcher {
 
 impl Sight {
     fn reports(&self) -> Vec<RobotReport> {
-        let report = |(robot_id, live): (RobotId, Arc<Live>)| {
+        let report = |(robot_id, live): (RobotId, Arc<NewestHeartbeat>)| {
             let at = live.report.vitals.waypoint.as_ref().and_then(|w| self.site.find(w));
             let state = live.report.update.as_ref().map(|u| u.state);
             RobotReport {

@@ -11,7 +11,7 @@ use super::requests::{PendingCommand, Question, Request};
 use crate::collect::NamedBundles;
 use crate::service::OtaService;
 use midshift_core::Boxed;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::RobotId;
 use midshift_core::item::Item;
 use midshift_core::leadership::{LeaderLease, LeaseAction, OtaLeader, OwnEntries};
@@ -45,7 +45,7 @@ pub struct Parts {
     /// The memory that services share.
     pub store: Arc<dyn Store>,
     /// Newest heartbeats, written by telemetry.
-    pub board: Arc<LiveBoard<Live>>,
+    pub board: Arc<LiveBoard<NewestHeartbeat>>,
     /// The site.
     pub site: Arc<Site>,
     /// Where the time of the wall, the link and the site is read.
@@ -68,7 +68,7 @@ pub(super) struct Loop {
     pub(super) view: RolloutProjection,
     pub(super) seq: Seq,
     pub(super) board: Board,
-    dirty: Dirty<Live>,
+    dirty: Dirty<NewestHeartbeat>,
     /// Robots with a heartbeat that no plan has seen.
     heard: BTreeSet<RobotId>,
     started: Now,

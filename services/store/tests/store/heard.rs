@@ -3,7 +3,7 @@
 use crate::support::{
     Bench, clock, database, item, memory, postgres_at, put, say, site, stranger, until_a_writer_waits,
 };
-use midshift_core::heartbeat::{ClockOffset, Live};
+use midshift_core::heartbeat::{ClockOffset, NewestHeartbeat};
 use midshift_core::ids::RobotId;
 use midshift_core::item::{Expect, Item, Silent};
 use midshift_core::robot::ReportedState;
@@ -141,8 +141,8 @@ async fn two_gateways_that_keep_at_once_are_read_without_a_hole() {
     tasks.join_all().await;
 }
 
-fn live(id: &str, hb: u64) -> Live {
-    Live {
+fn live(id: &str, hb: u64) -> NewestHeartbeat {
+    NewestHeartbeat {
         robot_id: robot(id),
         report: ReportedState { hb, session_epoch: 1, ..ReportedState::default() },
         processed_at: midshift_core::time::LinkTime(77),

@@ -1,6 +1,6 @@
 //! Telemetry over a real gRPC connection in memory, and a robot that says what a test wants.
 
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::identity::{Caller, Digest, TokenId};
 use midshift_core::ids::{RobotId, SiteId, WaypointId};
 use midshift_core::robot::{Lane, Mode, ReportedState, Vitals};
@@ -28,7 +28,7 @@ pub struct World {
     pub store: Arc<dyn Store>,
     pub channel: Channel,
     pub service: TelemetryService,
-    pub board: Arc<LiveBoard<Live>>,
+    pub board: Arc<LiveBoard<NewestHeartbeat>>,
     /// Ends the service.
     pub end: CancellationToken,
     go_away: GoAwayNotices,

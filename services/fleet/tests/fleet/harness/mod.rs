@@ -14,7 +14,7 @@ pub use shaky::Shaky;
 
 use midshift_core::fleet::bugs::Bugs;
 use midshift_core::fleet::maps::MapChange;
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::{RobotId, SiteId, TaskId};
 use midshift_core::item::{Expect, Item};
 use midshift_core::rows::{Entry, Record, Seq, Table, Writer};
@@ -51,7 +51,7 @@ pub struct World {
     pub store: Arc<dyn Store>,
     /// The store as fleet sees it.
     pub shaky: Arc<Shaky>,
-    pub board: Arc<LiveBoard<Live>>,
+    pub board: Arc<LiveBoard<NewestHeartbeat>>,
     pub clock: Arc<dyn Clock>,
     pub site: Arc<Site>,
     pub fleet: FleetService,

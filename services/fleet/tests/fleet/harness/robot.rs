@@ -2,7 +2,7 @@
 
 use midshift_core::authority::{Authority, SentHeartbeats};
 use midshift_core::desired_state::{Assignment, DesiredWork, RoutePoint};
-use midshift_core::heartbeat::Live;
+use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::{AttemptId, PlaceId, RobotId, StopId, WaypointId};
 use midshift_core::reason::{Code, Reason};
 use midshift_core::robot::WorkState;
@@ -297,7 +297,7 @@ impl Robot {
     pub(super) fn due(&self, now: &Now) -> bool {
         self.talks && self.beaten.is_none_or(|at| now.link.since(at).as_ms() >= 1_000)
     }
-    pub(super) fn heartbeat(&mut self, now: &Now) -> Live {
+    pub(super) fn heartbeat(&mut self, now: &Now) -> NewestHeartbeat {
         self.hb += 1;
         self.beaten = Some(now.link);
         self.sent.sent(self.hb, now.link);
@@ -325,7 +325,7 @@ impl Robot {
             fault: self.fault.clone(),
             ..ReportedState::default()
         };
-        Live {
+        NewestHeartbeat {
             robot_id: self.id.clone(),
             report,
             processed_at: now.link,
