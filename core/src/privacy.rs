@@ -210,7 +210,7 @@ retention_rules! {
     Place::Table(Table::Token) => [Person, Credential] Identify Standing;
     Place::Table(Table::TokenName) => [Person] Identify Standing;
     Place::Table(Table::RobotIdentity) => [Machine, Credential, Person] Identify Standing;
-    Place::Table(Table::Authority) => [Machine] Identify Standing;
+    Place::Table(Table::RootCertificate) => [Machine] Identify Standing;
     Place::Table(Table::ServerCertificate) => [Machine] Identify Standing;
     Place::Table(Table::TaskAudit) => [Person, Operations] Account Year;
     Place::Table(Table::FleetAudit) => [Person, Operations] Account Year;

@@ -102,7 +102,7 @@ tables! {
     Token "token" Identity, "A token of a person or a program: digest, rights, expiry. id = token_id, order = creation.";
     TokenName "token_name" Identity, "The newest token of a name, so that no two are made of one. id = name.";
     RobotIdentity "robot_identity" Identity, "A robot's key, the newest secret that enrols it, keys that were taken out. id = robot_id.";
-    Authority "authority" Identity, "The root certificate of the site. id = site_id.";
+    RootCertificate "authority" Identity, "The root certificate of the site. id = site_id.";
     ServerCertificate "server_certificate" Identity, "What one server process asked to prove itself with, and the answer. id = digest of its key.";
     TaskAudit "task_audit" Task, "What people and programs asked of task intake, as a chain. Order = number. Written by notes of items alone.";
     FleetAudit "fleet_audit" Fleet, "What they decided about robots, places and areas, as a chain.";

@@ -63,7 +63,7 @@ impl Site {
     pub async fn with(robots: usize, room: &Path) -> anyhow::Result<Self> {
         let clock: Arc<dyn Clock> = midshift_process::clock::clock(1000);
         let store = MemoryStore::new(SiteId::parse(SITE)?, StoreId::fresh(), clock.clone());
-        let (duty, names) = (Duty::Authority, Vec::new());
+        let (duty, names) = (Duty::CertificateAuthority, Vec::new());
         let folder = room.join("identity");
         let parts = Parts { folder, store: Arc::new(store), clock, duty, names, trust_json: String::new() };
         let identity = IdentityService::open(parts, &CancellationToken::new()).await?;

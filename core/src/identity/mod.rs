@@ -26,7 +26,7 @@ pub use enrolment::{Deny, EnrolmentState, Replace, RobotIdentity};
 pub use grant::{Access, Grant, HeldGrant, Object, Permission, Role, Scope};
 pub use proof::ServerProof;
 pub use revocation::{Revocation, revocations};
-pub use rows::{Act, Authority, Rotation, ServerCertificate, TokenName, TokenRecord};
+pub use rows::{Act, RootCertificate, Rotation, ServerCertificate, TokenName, TokenRecord};
 pub use session::SessionSecret;
 pub use token::{Digest, Secret, TokenId};
 

@@ -112,15 +112,15 @@ impl Record for TokenRecord {
 
 /// The certificate authority of the site: the public half. Its key is in a file of the process with role identity.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Authority {
+pub struct RootCertificate {
     /// Which site.
     pub site_id: crate::ids::SiteId,
     /// The root certificate, PEM.
     pub certificate_pem: String,
 }
 
-impl Record for Authority {
-    const TABLE: Table = Table::Authority;
+impl Record for RootCertificate {
+    const TABLE: Table = Table::RootCertificate;
     body_is_json!();
     fn id(&self) -> String {
         self.site_id.to_string()

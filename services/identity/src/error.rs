@@ -45,7 +45,7 @@ pub enum Error {
     Signing(#[source] rcgen::Error),
     /// The store has a root and the folder has none, or another one.
     #[error("the store knows another root certificate of this site than {path} has: bring that folder back from a backup; robots and people trust the root in the store", path = path.display())]
-    OtherAuthority {
+    OtherCertificateAuthority {
         /// The folder.
         path: PathBuf,
     },

@@ -1,6 +1,6 @@
 //! The two faces: decode, decide, encode.
 
-use crate::authority::{Authority, SignedCertificate, read_signing_request};
+use crate::certificate_authority::{CertificateAuthority, SignedCertificate, read_signing_request};
 use crate::register::decided;
 use crate::tokens::rotate::{self, Turn};
 use crate::tokens::{self, NewToken};
@@ -38,7 +38,7 @@ impl IdentityService {
         self.0.clock.now().wall
     }
 
-    fn authority(&self) -> Result<&Authority, Refusal> {
+    fn authority(&self) -> Result<&CertificateAuthority, Refusal> {
         let elsewhere = || {
             Reason::new(
                 Code::ServedElsewhere,
@@ -49,7 +49,7 @@ impl IdentityService {
     }
 
     /// The authority and the time to sign by, if that of this machine is not in doubt: what it signs has its beginning and its end by it.
-    fn signing(&self) -> Result<(&Authority, Utc), Refusal> {
+    fn signing(&self) -> Result<(&CertificateAuthority, Utc), Refusal> {
         match self.0.clock.undoubted() {
             Err(_) => Err(Refusal::new(Kind::Unavailable, Code::ClockDoubted)),
             Ok(now) => Ok((self.authority()?, now.wall)),

@@ -6,7 +6,7 @@
 //! 3. Every process has a projection of the known principals, and a key of its own.
 
 pub mod audit;
-mod authority;
+mod certificate_authority;
 mod encode;
 mod error;
 mod files;
@@ -19,7 +19,7 @@ mod retention;
 mod revocation_list;
 mod tokens;
 
-pub use authority::PUBLIC_FILE;
+pub use certificate_authority::PUBLIC_FILE;
 pub use error::Error;
 pub use files::{FOLDER, make_folder};
 pub use midshift_core::identity::ServerProof;
@@ -27,11 +27,11 @@ pub use proof::write_proof;
 pub use retention::prune;
 pub use revocation_list::RevocationList;
 
-use authority::{Authority, read_signing_request};
+use certificate_authority::{CertificateAuthority, read_signing_request};
 use error::ANSWERED_WITHIN;
 use midshift_core::Boxed;
 use midshift_core::audit::Note;
-use midshift_core::identity::{Authority as AuthorityRow, Directory, Secret, ServerCertificate, revocations};
+use midshift_core::identity::{Directory, RootCertificate, Secret, ServerCertificate, revocations};
 use midshift_core::ids::SiteId;
 use midshift_core::limits;
 use midshift_core::time::{Clock, Utc};
@@ -70,7 +70,7 @@ pub struct Parts {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Duty {
     /// It has the authority's key, signs, and serves identity.
-    Authority,
+    CertificateAuthority,
     /// It asks.
     Member,
 }
@@ -83,7 +83,7 @@ struct Inner {
     clock: Arc<dyn Clock>,
     store: Arc<dyn Store>,
     register: Register,
-    authority: Option<Authority>,
+    authority: Option<CertificateAuthority>,
     own: OwnKey,
     proof: watch::Sender<ServerProof>,
     trust_json: String,
@@ -112,7 +112,7 @@ impl IdentityService {
         let site_id = store.site_id().clone();
         let register = Register::new(store.clone(), clock.clone());
         let authority = match duty {
-            Duty::Authority => Some(own_authority(&folder, &site_id, &register, clock.now().wall).await?),
+            Duty::CertificateAuthority => Some(own_authority(&folder, &site_id, &register, clock.now().wall).await?),
             Duty::Member => None,
         };
         let mut all: Vec<String> = NAMES.map(str::to_owned).into();
@@ -242,17 +242,22 @@ impl IdentityService {
 }
 
 /// The authority in the folder: the one the rows know, or a first one.
-async fn own_authority(folder: &Path, site_id: &SiteId, register: &Register, now: Utc) -> Result<Authority, Error> {
+async fn own_authority(
+    folder: &Path,
+    site_id: &SiteId,
+    register: &Register,
+    now: Utc,
+) -> Result<CertificateAuthority, Error> {
     let known = register.ask(|view| view.authority.as_ref().map(|(row, _)| row.certificate_pem.clone()));
-    let (known, found) = (known.await.map_err(Error::Store)?, Authority::load(folder, site_id)?);
-    let other = || Error::OtherAuthority { path: folder.to_owned() };
+    let (known, found) = (known.await.map_err(Error::Store)?, CertificateAuthority::load(folder, site_id)?);
+    let other = || Error::OtherCertificateAuthority { path: folder.to_owned() };
     let authority = match (known, found) {
         (Some(known), Some(found)) if found.certificate_pem() == known => return Ok(found),
         (Some(_), _) => return Err(other()),
         (None, Some(found)) => found,
-        (None, None) => Authority::make(folder, site_id, now)?,
+        (None, None) => CertificateAuthority::make(folder, site_id, now)?,
     };
-    let row = AuthorityRow { site_id: site_id.clone(), certificate_pem: authority.certificate_pem().to_owned() };
+    let row = RootCertificate { site_id: site_id.clone(), certificate_pem: authority.certificate_pem().to_owned() };
     let told = register.decide(|view| match &view.authority {
         None => Ok((Some(written(&row, None, "midshift", "authority.made")), true)),
         Some((known, _)) => Ok((None, known.certificate_pem == row.certificate_pem)),
@@ -261,7 +266,7 @@ async fn own_authority(folder: &Path, site_id: &SiteId, register: &Register, now
 }
 
 /// Signs what servers asked for.
-async fn answer(authority: &Authority, register: &Register, now: Utc) -> Result<(), Error> {
+async fn answer(authority: &CertificateAuthority, register: &Register, now: Utc) -> Result<(), Error> {
     let open = |row: &&ServerCertificate| row.chain_pem.is_none();
     let waiting =
         register.ask(|view| view.servers.values().map(|(row, _)| row).filter(open).cloned().collect::<Vec<_>>());

@@ -3,7 +3,7 @@
 //! Invariant: the key never leaves its file. A process that shares the store with others is one of the site's servers: who may write there may ask for a
 //! certificate, so the store is as private as the authority (docs/security.md).
 
-use crate::authority::read_signing_request;
+use crate::certificate_authority::read_signing_request;
 use crate::register::{Register, written};
 use crate::{Error, files};
 use midshift_core::identity::{Digest, ServerCertificate, ServerProof};

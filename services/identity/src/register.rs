@@ -6,7 +6,7 @@
 
 use midshift_core::audit::Note;
 use midshift_core::identity::{
-    Actor, Authority, Directory, RobotIdentity, ServerCertificate, TokenId, TokenName, TokenRecord,
+    Actor, Directory, RobotIdentity, RootCertificate, ServerCertificate, TokenId, TokenName, TokenRecord,
 };
 use midshift_core::ids::RobotId;
 use midshift_core::item::{Expect, Item};
@@ -33,12 +33,12 @@ pub struct View {
     /// Certificates of servers, by the digest of the key.
     pub servers: BTreeMap<String, (ServerCertificate, Revision)>,
     /// The root.
-    pub authority: Option<(Authority, Revision)>,
+    pub authority: Option<(RootCertificate, Revision)>,
 }
 
 impl Fold for View {
     fn tables() -> &'static [Table] {
-        &[Table::Token, Table::TokenName, Table::RobotIdentity, Table::ServerCertificate, Table::Authority]
+        &[Table::Token, Table::TokenName, Table::RobotIdentity, Table::ServerCertificate, Table::RootCertificate]
     }
     fn reset(&mut self) {
         *self = Self::default();
@@ -64,7 +64,9 @@ impl Fold for View {
                 Some(server) => drop(self.servers.insert(server.id(), (server, revision))),
                 None => drop(self.servers.remove(&*change.key.id)),
             },
-            Table::Authority => self.authority = change.decode::<Authority>()?.map(|authority| (authority, revision)),
+            Table::RootCertificate => {
+                self.authority = change.decode::<RootCertificate>()?.map(|authority| (authority, revision))
+            }
             _ => {}
         }
         Ok(())

@@ -325,7 +325,7 @@ async fn open_identity(
         folder: args.own_keys(),
         store: storage.store(),
         clock: clock.clone(),
-        duty: if roles.has(Role::Identity) { Duty::Authority } else { Duty::Member },
+        duty: if roles.has(Role::Identity) { Duty::CertificateAuthority } else { Duty::Member },
         names,
         trust_json: match &args.trust {
             Some(file) => std::fs::read_to_string(file).with_context(|| format!("reading {}", file.display()))?,

@@ -1,6 +1,6 @@
 //! Ports with login: who a certificate or a token makes of a peer, and what that peer may ask for.
 
-use crate::proofs::{Authority, Identity};
+use crate::proofs::{CertificateAuthority, Identity};
 use crate::world::{Client, Whole, World, whole, within};
 use http::Request;
 use midshift_core::identity::{Actor, Digest, Directory, DirectoryToken, Secret, TokenId};
@@ -27,7 +27,7 @@ pub struct Port {
     /// How far the wall stepped ahead.
     stepped_ms: Arc<AtomicU64>,
     pub world: World,
-    pub authority: Authority,
+    pub authority: CertificateAuthority,
     known: Arc<SitePrincipals>,
     denials: mpsc::Receiver<Denial>,
     _tls: watch::Sender<Arc<rustls::ServerConfig>>,
@@ -45,7 +45,8 @@ impl Port {
         Self::with(Config::default()).await
     }
     pub async fn with(config: Config) -> Self {
-        let (authority, us, stepped_ms) = (Authority::new(), Arc::<AtomicU64>::default(), Arc::<AtomicU64>::default());
+        let (authority, us, stepped_ms) =
+            (CertificateAuthority::new(), Arc::<AtomicU64>::default(), Arc::<AtomicU64>::default());
         let (source, beside, ahead) = (us.clone(), us.clone(), stepped_ms.clone());
         let wall =
             move || Utc(BEGIN).plus_ms(beside.load(Ordering::Relaxed) / 1000).plus_ms(ahead.load(Ordering::Relaxed));

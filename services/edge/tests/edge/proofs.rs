@@ -20,14 +20,14 @@ use tokio_stream::StreamExt;
 use tokio_util::sync::CancellationToken;
 
 /// Who signs certificates of servers and of robots alike.
-pub struct Authority(CertifiedIssuer<'static, KeyPair>);
+pub struct CertificateAuthority(CertifiedIssuer<'static, KeyPair>);
 
 pub struct Identity {
     pub leaf: CertificateDer<'static>,
     key: PrivateKeyDer<'static>,
 }
 
-impl Authority {
+impl CertificateAuthority {
     pub fn new() -> Self {
         let mut params = CertificateParams::new(Vec::new()).expect("parameters");
         params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
@@ -110,7 +110,7 @@ fn leaf(stream: &TlsStream<TcpStream>) -> Vec<u8> {
 
 #[tokio::test]
 async fn a_peer_that_never_shakes_hands_is_closed() {
-    let (_newest, tls) = watch::channel(Authority::new().server(Clients::NotAsked));
+    let (_newest, tls) = watch::channel(CertificateAuthority::new().server(Clients::NotAsked));
     let world = proven(Config { tls_handshake: SOON, ..Config::default() }, tls).await;
     let mut silent = dial(world.address, HERE).await;
     within(until_closed(&mut silent)).await;
@@ -119,7 +119,7 @@ async fn a_peer_that_never_shakes_hands_is_closed() {
 
 #[tokio::test]
 async fn a_peer_that_speaks_plain_text_is_closed() {
-    let (_newest, tls) = watch::channel(Authority::new().server(Clients::NotAsked));
+    let (_newest, tls) = watch::channel(CertificateAuthority::new().server(Clients::NotAsked));
     let world = proven(Config::default(), tls).await;
     let mut plain = dial(world.address, HERE).await;
     plain.write_all(PREFACE).await.expect("written");
@@ -129,7 +129,7 @@ async fn a_peer_that_speaks_plain_text_is_closed() {
 
 #[tokio::test]
 async fn the_next_connection_sees_a_new_certificate_and_the_old_one_goes_on() {
-    let authority = Authority::new();
+    let authority = CertificateAuthority::new();
     let (newest, tls) = watch::channel(authority.server(Clients::NotAsked));
     let world = proven(Config::default(), tls).await;
     let before = authority.connect(&world, None).await.expect("a handshake");
@@ -146,7 +146,7 @@ async fn the_next_connection_sees_a_new_certificate_and_the_old_one_goes_on() {
 
 #[tokio::test]
 async fn a_service_hears_which_certificate_was_proven() {
-    let authority = Authority::new();
+    let authority = CertificateAuthority::new();
     let (_newest, tls) = watch::channel(authority.server(Clients::Asked(vec![authority.root()])));
     let world = proven(Config::default(), tls).await;
     let robot = authority.issue("r7");
@@ -158,7 +158,7 @@ async fn a_service_hears_which_certificate_was_proven() {
 
 #[tokio::test]
 async fn where_a_certificate_is_required_nobody_comes_in_without_one_of_ours() {
-    let (ours, another) = (Authority::new(), Authority::new());
+    let (ours, another) = (CertificateAuthority::new(), CertificateAuthority::new());
     let (_newest, tls) = watch::channel(ours.server(Clients::Required(vec![ours.root()])));
     let world = proven(Config::default(), tls).await;
     for shown in [None, Some(another.issue("r7"))] {
@@ -175,7 +175,7 @@ async fn where_a_certificate_is_required_nobody_comes_in_without_one_of_ours() {
 
 #[tokio::test]
 async fn who_comes_again_proves_its_certificate_again() {
-    let authority = Authority::new();
+    let authority = CertificateAuthority::new();
     let (_newest, tls) = watch::channel(authority.server(Clients::Asked(vec![authority.root()])));
     let world = proven(Config::default(), tls).await;
     // One memory of sessions for both.

@@ -199,7 +199,7 @@ const STANDING: &[(Table, &str)] = &[
     (Table::OtaMark, "one a store"),
     (Table::OtaClock, "one a store"),
     (Table::OtaLeader, "one a store"),
-    (Table::Authority, "one a site"),
+    (Table::RootCertificate, "one a site"),
 ];
 
 #[test]

@@ -1,6 +1,6 @@
 //! Identity over a store in memory and real files: the site's authority, enrolment, tokens, and what goes after its time.
 
-mod authority;
+mod certificate_authority;
 mod enrolled;
 mod retained;
 mod rotated;

@@ -64,7 +64,7 @@ impl World {
         self.dir.path().join("identity")
     }
     pub async fn open(&self) -> Result<IdentityService, Error> {
-        self.open_in(self.folder(), Duty::Authority).await
+        self.open_in(self.folder(), Duty::CertificateAuthority).await
     }
     pub async fn open_in(&self, folder: PathBuf, duty: Duty) -> Result<IdentityService, Error> {
         let parts = Parts {

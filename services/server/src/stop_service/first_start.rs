@@ -59,7 +59,7 @@ const TABLES: &[Table] = &[
     Table::Session,
     Table::StopRecord,
     Table::RobotIdentity,
-    Table::Authority,
+    Table::RootCertificate,
     Table::ServerCertificate,
     Table::Token,
     Table::TokenName,

@@ -15,12 +15,12 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// Who signs for a database and its clients.
-struct Authority {
+struct CertificateAuthority {
     issuer: Issuer<'static, KeyPair>,
     pem: String,
 }
 
-impl Authority {
+impl CertificateAuthority {
     fn new() -> Self {
         let mut params = CertificateParams::default();
         params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
@@ -92,7 +92,7 @@ async fn refused(url: &str) -> String {
 
 #[tokio::test]
 async fn everything_of_a_store_goes_over_tls_1_3_when_both_sides_prove_themselves() {
-    let (authority, files) = (Authority::new(), Files(tempfile::tempdir().unwrap()));
+    let (authority, files) = (CertificateAuthority::new(), Files(tempfile::tempdir().unwrap()));
     let (chain, key) = authority.server(&["127.0.0.1"]);
     let server = PostgresServer::secured(&Proof { chain: &chain, key: &key, root: &authority.pem });
     let root = files.write("root.crt", &authority.pem);
@@ -118,7 +118,7 @@ async fn everything_of_a_store_goes_over_tls_1_3_when_both_sides_prove_themselve
 
 #[tokio::test]
 async fn neither_a_false_server_nor_a_client_without_a_certificate_comes_to_a_connection() {
-    let (authority, other) = (Authority::new(), Authority::new());
+    let (authority, other) = (CertificateAuthority::new(), CertificateAuthority::new());
     let files = Files(tempfile::tempdir().unwrap());
     let (chain, key) = authority.server(&["127.0.0.1"]);
     let server = PostgresServer::secured(&Proof { chain: &chain, key: &key, root: &authority.pem });
@@ -157,7 +157,7 @@ async fn neither_a_false_server_nor_a_client_without_a_certificate_comes_to_a_co
 
 #[tokio::test]
 async fn a_server_that_speaks_plain_text_is_told_nothing_where_proof_was_asked() {
-    let (authority, files) = (Authority::new(), Files(tempfile::tempdir().unwrap()));
+    let (authority, files) = (CertificateAuthority::new(), Files(tempfile::tempdir().unwrap()));
     let root = files.write("root.crt", &authority.pem);
     let server = PostgresServer::start();
     server.database_named("rows");

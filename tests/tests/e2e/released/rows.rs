@@ -132,7 +132,7 @@ records! {
     Token identity::TokenRecord;
     TokenName identity::TokenName;
     RobotIdentity identity::RobotIdentity;
-    Authority identity::Authority;
+    RootCertificate identity::RootCertificate;
     ServerCertificate identity::ServerCertificate;
     TaskAudit audit::TaskAudit;
     FleetAudit audit::FleetAudit;

@@ -68,7 +68,7 @@ async fn a_message_that_is_too_large_is_refused_when_it_is_announced_at_each_ser
         folder: folder.path().join("identity"),
         store: parts.store.clone(),
         clock: parts.clock.clone(),
-        duty: Duty::Authority,
+        duty: Duty::CertificateAuthority,
         names: Vec::new(),
         trust_json: String::new(),
     };

@@ -33,7 +33,7 @@ async fn a_store_that_knows_a_root_gets_no_second_one_from_an_empty_folder() {
     let world = World::new();
     drop(world.open().await.expect("opened"));
     std::fs::rename(world.folder(), world.dir.path().join("kept")).expect("moved away");
-    assert!(matches!(world.open().await, Err(Error::OtherAuthority { .. })));
+    assert!(matches!(world.open().await, Err(Error::OtherCertificateAuthority { .. })));
     std::fs::remove_dir_all(world.folder()).expect("what it made is no authority");
     std::fs::rename(world.dir.path().join("kept"), world.folder()).expect("brought back");
     assert!(world.open().await.is_ok());

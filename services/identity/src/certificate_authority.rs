@@ -23,7 +23,7 @@ const FILE: &str = "authority.pem";
 pub const PUBLIC_FILE: &str = "ca.pem";
 
 /// The certificate authority of a site, with its private key.
-pub struct Authority {
+pub struct CertificateAuthority {
     issuer: Issuer<'static, KeyPair>,
     certificate_pem: String,
     pin: Digest,
@@ -61,7 +61,7 @@ pub fn read_signing_request(request_pem: &str) -> Result<SigningRequest, Refusal
     Ok(SigningRequest { parameters, key })
 }
 
-impl Authority {
+impl CertificateAuthority {
     /// The one in `folder`; none if it has none.
     pub fn load(folder: &Path, site_id: &SiteId) -> Result<Option<Self>, Error> {
         let Some(text) = files::read(folder, FILE)? else { return Ok(None) };
