@@ -1,6 +1,6 @@
 use super::*;
 use clap::Parser;
-use midshift_core::audit::{By, Note, append};
+use midshift_core::audit::{Attribution, Note, append};
 use midshift_core::rows::Writer;
 use std::collections::BTreeMap;
 
@@ -37,7 +37,7 @@ fn heads_are_given_as_they_were_printed_and_as_often_as_they_were() {
 /// An export of one chain of three rows.
 fn lines() -> Vec<String> {
     let mut heads = BTreeMap::new();
-    let by = By { actor: "anna".into(), token: None, request_id: None, at_unix_ms: 1 };
+    let by = Attribution { actor: "anna".into(), token: None, request_id: None, at_unix_ms: 1 };
     let rows = ["r1", "r2", "r3"]
         .map(|robot| append(&mut heads, Writer::Fleet, &Note::new("robot.cordon").about("robot", robot), &by));
     let heads = heads.into_iter().map(|(writer, head)| (writer.as_str().to_owned(), head)).collect();

@@ -53,7 +53,7 @@ impl Kind {
 
 /// On whose behalf a row is written.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct By {
+pub struct Attribution {
     /// The actor as it is named in rows: a person, a program, a robot or a service.
     pub actor: Arc<str>,
     /// The token that was shown; none: none was.
@@ -72,7 +72,7 @@ pub struct Draft {
     /// What was done, about which things, and why.
     pub note: Box<Note>,
     /// On whose behalf.
-    pub by: By,
+    pub by: Attribution,
 }
 
 impl Draft {
@@ -208,7 +208,7 @@ pub fn id_of(n: u64) -> String {
 }
 
 /// The next row of the chain of `writer`, and moves its head. None: this writer has no chain.
-pub fn append(heads: &mut BTreeMap<Writer, Head>, writer: Writer, note: &Note, by: &By) -> Option<Row> {
+pub fn append(heads: &mut BTreeMap<Writer, Head>, writer: Writer, note: &Note, by: &Attribution) -> Option<Row> {
     let table = Table::audit_of(writer)?;
     let before = heads.get(&writer).cloned().unwrap_or_default();
     let others = heads.iter().filter(|(other, _)| **other != writer && note.action == ANCHOR);

@@ -8,8 +8,8 @@ mod note;
 mod verify;
 
 pub use chain::{
-    AuditRow, By, DONE, Draft, FleetAudit, IdentityAudit, Kind, Opened, OtaAudit, StopAudit, TaskAudit, append, id_of,
-    link, open,
+    Attribution, AuditRow, DONE, Draft, FleetAudit, IdentityAudit, Kind, Opened, OtaAudit, StopAudit, TaskAudit,
+    append, id_of, link, open,
 };
 pub use note::{ANCHOR, CUT, Crowd, Head, NOTHING, Note};
 pub use verify::{Broken, Chain, Ends, Export, Held, Mark, Verified};

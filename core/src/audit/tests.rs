@@ -6,8 +6,8 @@ use crate::reason::{Kind as RefusalKind, Reason, Refusal};
 use crate::time::Utc;
 use proptest::prelude::*;
 
-fn by(actor: &str, at_unix_ms: i64) -> By {
-    By { actor: actor.into(), token: None, request_id: Some("req-1".into()), at_unix_ms }
+fn by(actor: &str, at_unix_ms: i64) -> Attribution {
+    Attribution { actor: actor.into(), token: None, request_id: Some("req-1".into()), at_unix_ms }
 }
 
 /// Rows of a chain of fleet, behind whatever is in `heads`.

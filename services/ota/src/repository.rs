@@ -16,7 +16,7 @@ pub use documents::Documents;
 pub(crate) use documents::every_second;
 pub use error::Error;
 pub use files::raise_floor;
-pub use newest::{By, Newest, Release, SignedDocument};
+pub use newest::{Newest, Publishers, Release, SignedDocument};
 pub use online::OnlineKeys;
 
 use crate::content::Content;
@@ -24,7 +24,7 @@ use crate::disk::write_whole;
 use crate::folder::{Gate, Turn};
 use crate::threads::blocking;
 use error::io;
-use files::{BY, SEEN, TIMESTAMP, file, read, read_by, read_floor, read_seen};
+use files::{BY, SEEN, TIMESTAMP, file, read, read_floor, read_publishers, read_seen};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::freshness::{Stamp, newest_targets, root_edition, stamp};
 use midshift_bundle::keys::SecretKey;
@@ -402,9 +402,9 @@ impl Repository {
         blocking(move || read_seen(&folder)).await
     }
 
-    async fn by(&self) -> Result<By, Error> {
+    async fn by(&self) -> Result<Publishers, Error> {
         let folder = self.folder.clone();
-        blocking(move || read_by(&folder)).await
+        blocking(move || read_publishers(&folder)).await
     }
 
     /// Writes one document after the other, each whole and durable, and shows the result: also if nobody waits for it any more.

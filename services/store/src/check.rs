@@ -3,7 +3,7 @@
 //! Invariant: nothing here depends on the engine, so that all engines refuse the same items for the same reason.
 
 use crate::{Applied, CommitError, ID_BYTES_MAX};
-use midshift_core::audit::{By, Draft};
+use midshift_core::audit::{Attribution, Draft};
 use midshift_core::item::{Expect, Fact, Item, RowChange, Write};
 use midshift_core::rows::{Entry, Index, Key, Log, Revision, Row, Seq, Table};
 use std::collections::BTreeSet;
@@ -104,7 +104,7 @@ pub(crate) fn decide(
     form(&item)?;
     expectations(&item, found)?;
     let Item { writer, actor, token, request_id, rows, facts, note, silent: _ } = item;
-    let by = By { actor: actor.clone(), token, request_id: request_id.clone(), at_unix_ms };
+    let by = Attribution { actor: actor.clone(), token, request_id: request_id.clone(), at_unix_ms };
     let audited = note.map(|note| Draft { writer, note, by });
     let applied = Applied { seq: head, revisions: Vec::new() };
     let mut decided = Decided { rows: Vec::new(), entries: Vec::new(), audited, applied };

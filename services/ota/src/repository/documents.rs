@@ -10,8 +10,8 @@
 use super::cannot_sign::SetLost;
 use super::check;
 use super::error::Error;
-use super::files::{TIMESTAMP, file, read, read_by, read_seen};
-use super::newest::{By, Newest, Release, SignedDocument};
+use super::files::{TIMESTAMP, file, read, read_publishers, read_seen};
+use super::newest::{Newest, Publishers, Release, SignedDocument};
 use crate::content::Content;
 use crate::threads::blocking;
 use midshift_bundle::digest::Digest;
@@ -248,7 +248,7 @@ struct Found {
     timestamp: Vec<u8>,
     stamp: Stamp,
     seen: BTreeMap<Digest, Utc>,
-    by: By,
+    by: Publishers,
 }
 
 impl Found {
@@ -260,7 +260,7 @@ impl Found {
             timestamp: known.timestamp.clone(),
             stamp: known.stamp,
             seen: read_seen(folder)?,
-            by: read_by(folder)?,
+            by: read_publishers(folder)?,
         })
     }
 
@@ -374,7 +374,7 @@ fn find(folder: &Path) -> Result<Option<Found>, Error> {
         timestamp: online.timestamp,
         stamp,
         seen: read_seen(folder)?,
-        by: read_by(folder)?,
+        by: read_publishers(folder)?,
     }))
 }
 

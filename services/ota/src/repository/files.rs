@@ -1,7 +1,7 @@
 //! Files of the folder of documents: their names, and how they are read.
 
 use super::error::{Error, io};
-use super::newest::By;
+use super::newest::Publishers;
 use crate::disk::write_whole;
 use midshift_bundle::digest::Digest;
 use midshift_core::time::Utc;
@@ -44,7 +44,7 @@ pub fn read_seen(folder: &Path) -> Result<BTreeMap<Digest, Utc>, Error> {
 }
 
 /// Who published what.
-pub fn read_by(folder: &Path) -> Result<By, Error> {
+pub fn read_publishers(folder: &Path) -> Result<Publishers, Error> {
     let bytes = read(&folder.join(BY))?.unwrap_or_else(|| b"{}".to_vec());
     serde_json::from_slice(&bytes).map_err(|e| Error::Damaged { folder: folder.to_owned(), text: format!("{BY}: {e}") })
 }

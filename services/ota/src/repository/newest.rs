@@ -35,7 +35,7 @@ pub struct Release {
 /// Who published what: nothing that robots see. Of a publication by an older release nobody is known.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct By {
+pub struct Publishers {
     /// The newest targets document.
     newest: Option<String>,
     /// The token that was shown for it.
@@ -46,7 +46,7 @@ pub struct By {
     tokens: BTreeMap<Digest, TokenId>,
 }
 
-impl By {
+impl Publishers {
     /// After a publication of these.
     pub(super) fn after(mut self, by: &Actor, releases: &[Release]) -> Self {
         let is_listed = |digest: &Digest| releases.iter().any(|release| release.digest == *digest);
@@ -84,7 +84,7 @@ pub struct Newest {
     /// Bundles by name and version.
     pub releases: Vec<Release>,
     /// Who published them.
-    pub by: By,
+    pub by: Publishers,
     /// The newest set of keys that sign directives; none: robots have them from their trust files alone, or it is listed and cannot be read.
     pub key_set: Option<KeySet>,
     /// Manifests that are listed and that the disk did not give, though they are there, and the newest set of directive keys if it could not be
@@ -114,7 +114,7 @@ impl Newest {
             stamp,
             files,
             releases,
-            by: By::default(),
+            by: Publishers::default(),
             key_set: None,
             unread: BTreeSet::new(),
             set_lost: None,

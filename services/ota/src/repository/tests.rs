@@ -4,7 +4,7 @@ mod anew;
 mod key_sets;
 mod unread;
 
-use super::{Act, By, Error, FRESHEN_AFTER_MS, OnlineKeys, Repository, write_whole};
+use super::{Act, Error, FRESHEN_AFTER_MS, OnlineKeys, Publishers, Repository, write_whole};
 use crate::content::Content;
 use crate::fixture::{Room, SEEDS, START, Seeds, bundle, files, first_root, key, robot, root, target, targets};
 use midshift_bundle::digest::Digest;
@@ -140,7 +140,7 @@ async fn who_published_each_bundle_is_known_also_after_a_start() {
     let act = Act { by: "anna".into(), at: START };
     let newest = room.repository.publish(Vec::new(), second, 1, act).await.expect("the second");
     let old = newest.releases[0].digest;
-    let known = |by: &By| (by.newest().map(|by| by.to_string()), by.bundle(&old).map(|by| by.to_string()));
+    let known = |by: &Publishers| (by.newest().map(|by| by.to_string()), by.bundle(&old).map(|by| by.to_string()));
     let expected = (Some("anna".to_owned()), Some("release".to_owned()));
     assert_eq!(known(&newest.by), expected);
     let again = room.restarted().await.repository.newest().expect("a release");

@@ -3,7 +3,7 @@
 //! Invariant: nothing is deleted here: a bundle that the release lists no more is unlisted, and its row stays as long
 //! as something names it ([`crate::retention`]).
 
-use crate::repository::{By, Newest};
+use crate::repository::{Newest, Publishers};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::{ComponentKind, Manifest, Migration};
 use midshift_core::audit::Note;
@@ -74,7 +74,7 @@ fn publisher(newest: Option<&Newest>, row: &Bundle) -> Actor {
     let digest = row.bundle.as_str().parse::<Digest>().ok();
     let whom = match row.listed {
         true => digest.and_then(|digest| by?.bundle(&digest)),
-        false => by.and_then(By::newest),
+        false => by.and_then(Publishers::newest),
     };
     whom.unwrap_or_else(|| "ota".into())
 }
