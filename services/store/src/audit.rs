@@ -14,20 +14,20 @@ pub(crate) type Heads = BTreeMap<Writer, Head>;
 
 /// What the items of one transaction leave in the audit, in their order.
 #[derive(Default)]
-pub(crate) struct Growth(Vec<Draft>);
+pub(crate) struct AuditDrafts(Vec<Draft>);
 
 /// Rows behind their chains, and what goes of those.
 #[derive(Default)]
-pub(crate) struct Grown {
+pub(crate) struct AuditRows {
     pub(crate) rows: Vec<Row>,
     pub(crate) writers: BTreeSet<Writer>,
     /// Rows of a table up to a number go.
     pub(crate) cuts: BTreeMap<Table, u64>,
 }
 
-impl Growth {
+impl AuditDrafts {
     /// What stands beside the note before it may share its row.
-    pub(crate) fn add(&mut self, draft: Draft) {
+    pub(crate) fn push(&mut self, draft: Draft) {
         let own = match self.0.last_mut() {
             Some(last) if last.writer == draft.writer => last.join(draft),
             _ => Some(draft),
@@ -39,16 +39,16 @@ impl Growth {
         self.0.is_empty()
     }
     /// Puts all of it behind the chains.
-    pub(crate) fn grow(self, heads: &mut Heads) -> Grown {
-        let mut grown = Grown::default();
+    pub(crate) fn append_to(self, heads: &mut Heads) -> AuditRows {
+        let mut appended = AuditRows::default();
         for Draft { writer, note, by } in self.0 {
             // A writer without a chain was refused before.
             let Some(row) = audit::append(heads, writer, &note, &by) else { continue };
-            grown.cuts.extend(note.cut.map(|head| (row.key.table, head.n)));
-            grown.writers.insert(writer);
-            grown.rows.push(row);
+            appended.cuts.extend(note.cut.map(|head| (row.key.table, head.n)));
+            appended.writers.insert(writer);
+            appended.rows.push(row);
         }
-        grown
+        appended
     }
 }
 

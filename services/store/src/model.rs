@@ -4,7 +4,7 @@
 //! Invariant: synchronous and deterministic: no task, no file, no randomness; same calls, same clock readings, same answers.
 //! Nothing survives the process.
 
-use crate::audit::{Growth, Heads};
+use crate::audit::{AuditDrafts, Heads};
 use crate::check::{After, decide, log_index};
 use crate::gather::Gathered;
 use crate::model_table::Rows;
@@ -41,7 +41,7 @@ struct State {
     tables: BTreeMap<Table, Rows>,
     logs: [MemoryLog; Log::ALL.len()],
     chains: Heads,
-    growth: Growth,
+    audit_drafts: AuditDrafts,
 }
 
 /// The entries of one log that were not pruned.
@@ -68,8 +68,9 @@ impl MemoryStore {
     /// An empty store whose numbers start at the clock's wall time now.
     pub fn new(site_id: SiteId, id: StoreId, clock: Arc<dyn Clock>) -> Self {
         let head = Seq(clock.now().wall.0.max(0).cast_unsigned());
-        let (tables, logs, chains, growth) = (BTreeMap::new(), Default::default(), Heads::new(), Growth::default());
-        let state = State { head, tables, logs, chains, growth };
+        let (tables, logs, chains, audit_drafts) =
+            (BTreeMap::new(), Default::default(), Heads::new(), AuditDrafts::default());
+        let state = State { head, tables, logs, chains, audit_drafts };
         let wake = watch::Sender::new(head);
         Self { id, site_id, clock, log_entries_max: LOG_ENTRIES_DEFAULT, shared: false, state: Mutex::new(state), wake }
     }
@@ -111,21 +112,21 @@ impl State {
         }
         self.head = decided.applied.seq;
         if let Some(draft) = decided.audited {
-            self.growth.add(draft);
+            self.audit_drafts.push(draft);
         }
         Ok(decided.applied)
     }
 
     /// After the last item of a call: the rows of the audit.
     fn seal(&mut self) {
-        if self.growth.is_empty() {
+        if self.audit_drafts.is_empty() {
             return;
         }
-        let grown = std::mem::take(&mut self.growth).grow(&mut self.chains);
-        for row in grown.rows {
+        let appended = std::mem::take(&mut self.audit_drafts).append_to(&mut self.chains);
+        for row in appended.rows {
             self.tables.entry(row.key.table).or_default().insert(row);
         }
-        for (table, up_to) in grown.cuts {
+        for (table, up_to) in appended.cuts {
             self.tables.entry(table).or_default().delete_up_to(up_to.cast_signed());
         }
     }

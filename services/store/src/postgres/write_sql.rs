@@ -3,7 +3,7 @@
 //! Invariant: as [`crate::sql`].
 
 use crate::audit::{self, Heads};
-use crate::group::{Group, Standing};
+use crate::group::{CurrentRevision, Group};
 use crate::sql::{self, ENTRY_COLUMNS, ROW_COLUMNS, ROW_CONFLICT, ord};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Revision, Row, Seq, Table};
@@ -94,7 +94,7 @@ pub(super) async fn chains(connection: &mut PgConnection, site_id: &SiteId) -> R
 
 /// Moves the heads of the chains that grew, and takes what was cut.
 pub(super) async fn grow(connection: &mut PgConnection, site_id: &SiteId, group: &Group) -> Result<(), sqlx::Error> {
-    for writer in &group.grown {
+    for writer in &group.audited_writers {
         let head = group.chains.get(writer).cloned().unwrap_or_default();
         let upsert = sqlx::query(sql::MOVE_AUDIT_HEAD).bind(site_id.as_str()).bind(writer.as_str());
         upsert.bind(head.n.cast_signed()).bind(head.hash).execute(&mut *connection).await?;
@@ -123,8 +123,8 @@ pub(super) async fn standings<'k>(
     connection: &mut PgConnection,
     site_id: &SiteId,
     keys: impl Iterator<Item = &'k Key>,
-) -> Result<HashMap<Key, Standing>, sqlx::Error> {
-    let mut found: HashMap<Key, Standing> = keys.map(|key| (key.clone(), None)).collect();
+) -> Result<HashMap<Key, CurrentRevision>, sqlx::Error> {
+    let mut found: HashMap<Key, CurrentRevision> = keys.map(|key| (key.clone(), None)).collect();
     let mut ids: BTreeMap<Table, Vec<String>> = BTreeMap::new();
     // An item with such an id is refused when it is judged.
     for key in found.keys().filter(|key| is_text(&key.id)) {

@@ -3,7 +3,7 @@
 //! Invariant: what is known here is what the last commit left; after a commit of unknown outcome everything is forgotten.
 //! Bounded by two generations: a key that is not asked for during a whole generation is dropped.
 
-use crate::group::Standing;
+use crate::group::CurrentRevision;
 use midshift_core::rows::Key;
 use std::collections::HashMap;
 
@@ -12,12 +12,12 @@ const GENERATION_KEYS: usize = 100_000;
 
 #[derive(Default)]
 pub(super) struct Revisions {
-    young: HashMap<Key, Standing>,
-    old: HashMap<Key, Standing>,
+    young: HashMap<Key, CurrentRevision>,
+    old: HashMap<Key, CurrentRevision>,
 }
 
 impl Revisions {
-    pub(super) fn get(&mut self, key: &Key) -> Option<Standing> {
+    pub(super) fn get(&mut self, key: &Key) -> Option<CurrentRevision> {
         if let Some(standing) = self.young.get(key) {
             return Some(*standing);
         }
@@ -26,7 +26,7 @@ impl Revisions {
         Some(standing)
     }
 
-    pub(super) fn note(&mut self, key: Key, standing: Standing) {
+    pub(super) fn note(&mut self, key: Key, standing: CurrentRevision) {
         if self.young.len() >= GENERATION_KEYS {
             self.old = std::mem::take(&mut self.young);
         }

@@ -6,7 +6,7 @@
 //! square. An engine that needs numbers writes them in [`placeholders`].
 
 use crate::audit::{self, Heads};
-use crate::group::{Group, Standing};
+use crate::group::{CurrentRevision, Group};
 use crate::sql::{self, ENTRY_COLUMNS, ROW_COLUMNS, ROW_CONFLICT, ord};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Revision, Row, Seq, Table};
@@ -141,7 +141,7 @@ pub(super) async fn grow(
     site_id: &SiteId,
     group: &Group,
 ) -> Result<(), sqlx::Error> {
-    for writer in &group.grown {
+    for writer in &group.audited_writers {
         let head = group.chains.get(writer).cloned().unwrap_or_default();
         let upsert = sqlx::query(sql::MOVE_AUDIT_HEAD).bind(site_id.as_str()).bind(writer.as_str());
         upsert.bind(head.n.cast_signed()).bind(head.hash).execute(&mut *connection).await?;
@@ -164,12 +164,12 @@ pub(super) async fn standings(
     connection: &mut SqliteConnection,
     site_id: &SiteId,
     keys: Vec<Key>,
-) -> Result<HashMap<Key, Standing>, sqlx::Error> {
+) -> Result<HashMap<Key, CurrentRevision>, sqlx::Error> {
     let mut ids: BTreeMap<Table, Vec<Arc<str>>> = BTreeMap::new();
     for key in &keys {
         ids.entry(key.table).or_default().push(key.id.clone());
     }
-    let mut found: HashMap<Key, Standing> = keys.into_iter().map(|key| (key, None)).collect();
+    let mut found: HashMap<Key, CurrentRevision> = keys.into_iter().map(|key| (key, None)).collect();
     for (table, ids) in ids {
         for slice in statements(&ids) {
             let list = placeholders(1, slice.len());

@@ -9,7 +9,7 @@ use super::revisions::Revisions;
 use super::tail::Tail;
 use super::write_sql;
 use crate::audit::Heads;
-use crate::group::{Group, Standing};
+use crate::group::{CurrentRevision, Group};
 use crate::queue::{Engine, Failed, Results, closed};
 use crate::{Cause, Error, OpenError, StoreId, sql};
 use midshift_core::ids::SiteId;
@@ -52,7 +52,7 @@ impl Writer {
     /// A group that knows where all rows stand that its items name.
     async fn begin(&mut self, items: &[Vec<Item>]) -> Result<Group, Cause> {
         self.connect().await?;
-        let mut base: HashMap<Key, Standing> = HashMap::new();
+        let mut base: HashMap<Key, CurrentRevision> = HashMap::new();
         let mut missing = Vec::new();
         for change in items.iter().flatten().flat_map(|i| &i.rows) {
             if base.contains_key(&change.key) {
@@ -126,7 +126,7 @@ impl Writer {
 
     /// After the commit: what was written is known, then readable at the head, then announced.
     fn publish_group(&mut self, group: Group) {
-        if !group.grown.is_empty() {
+        if !group.audited_writers.is_empty() {
             self.chains = Some(group.chains);
         }
         for (key, row) in group.rows {
