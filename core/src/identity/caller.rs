@@ -104,7 +104,7 @@ impl Caller {
         self.grants.iter().filter_map(HeldGrant::known)
     }
 
-    /// Whether a method with this rule is for it at all, somewhere. Of what it may be asked is held against [`Caller::may_over`] where the object is known;
+    /// Whether a method with this rule is for it at all, somewhere. Of what it may be asked is held against [`Caller::is_permitted_in`] where the object is known;
     /// a method of the whole site is decided here.
     ///
     /// # Errors
@@ -128,7 +128,7 @@ impl Caller {
 
     /// Whether it may do that to something that lies in these areas: each of them must be in the scope of a grant that permits it, and something without any
     /// area is the site's.
-    pub fn may_over<'a>(&self, permission: Permission, areas: impl IntoIterator<Item = &'a AreaId>) -> bool {
+    pub fn is_permitted_in<'a>(&self, permission: Permission, areas: impl IntoIterator<Item = &'a AreaId>) -> bool {
         if matches!(self.principal, Principal::Local) {
             return true;
         }
@@ -144,34 +144,34 @@ impl Caller {
         }
     }
 
-    /// As [`Caller::may_over`], as an answer.
+    /// As [`Caller::is_permitted_in`], as an answer.
     ///
     /// # Errors
     /// It may not.
-    pub fn needs<'a>(
+    pub fn authorize<'a>(
         &self,
         permission: Permission,
         areas: impl IntoIterator<Item = &'a AreaId>,
     ) -> Result<(), Refusal> {
-        if self.may_over(permission, areas) { Ok(()) } else { Err(self.denied(permission)) }
+        if self.is_permitted_in(permission, areas) { Ok(()) } else { Err(self.denied(permission)) }
     }
 
     /// Whether it may do that everywhere: where something lies does not matter then.
-    pub fn may_everywhere(&self, permission: Permission) -> bool {
-        self.may_over(permission, [])
+    pub fn is_permitted_everywhere(&self, permission: Permission) -> bool {
+        self.is_permitted_in(permission, [])
     }
 
     /// Whether it may do that to something that is there and lies in these areas. What it may not even see is `missing` to it.
     ///
     /// # Errors
     /// It may not see it, or sees it and may not do that.
-    pub fn acts_on<'a>(
+    pub fn authorize_visible<'a>(
         &self,
         permission: Permission,
         areas: impl IntoIterator<Item = &'a AreaId> + Copy,
         missing: impl FnOnce() -> Refusal,
     ) -> Result<(), Refusal> {
-        if self.may_over(Permission::Read, areas) { self.needs(permission, areas) } else { Err(missing()) }
+        if self.is_permitted_in(Permission::Read, areas) { self.authorize(permission, areas) } else { Err(missing()) }
     }
 
     /// Whether it is this robot, or one for whom robots' own calls are open.
@@ -231,12 +231,12 @@ mod tests {
     #[test]
     fn a_role_in_one_area_and_another_role_in_another_are_never_merged() {
         let caller = holder(&["operator@packing", "viewer@storage"]);
-        assert!(caller.may_over(Permission::Operate, [&area("packing")]));
-        assert!(!caller.may_over(Permission::Operate, [&area("storage")]));
-        assert!(caller.may_over(Permission::Read, [&area("packing"), &area("storage")]));
-        assert!(!caller.may_over(Permission::Operate, [&area("packing"), &area("storage")]));
-        assert!(!caller.may_over(Permission::Read, []), "what lies nowhere is the site's");
-        assert!(holder(&["viewer"]).may_over(Permission::Read, []));
+        assert!(caller.is_permitted_in(Permission::Operate, [&area("packing")]));
+        assert!(!caller.is_permitted_in(Permission::Operate, [&area("storage")]));
+        assert!(caller.is_permitted_in(Permission::Read, [&area("packing"), &area("storage")]));
+        assert!(!caller.is_permitted_in(Permission::Operate, [&area("packing"), &area("storage")]));
+        assert!(!caller.is_permitted_in(Permission::Read, []), "what lies nowhere is the site's");
+        assert!(holder(&["viewer"]).is_permitted_in(Permission::Read, []));
     }
 
     #[test]
@@ -244,12 +244,13 @@ mod tests {
         let caller = holder(&["operator@packing", "viewer@storage"]);
         let acts = |name: &str| {
             let missing = || Refusal::new(Kind::NotFound, Code::TaskNotFound);
-            caller.acts_on(Permission::Operate, [&area(name)], missing).map_err(|refusal| refusal.kind())
+            caller.authorize_visible(Permission::Operate, [&area(name)], missing).map_err(|refusal| refusal.kind())
         };
         assert_eq!(["packing", "storage", "yard"].map(acts), [Ok(()), Err(Kind::Denied), Err(Kind::NotFound)]);
-        assert!(!caller.may_everywhere(Permission::Read));
+        assert!(!caller.is_permitted_everywhere(Permission::Read));
         assert!(
-            holder(&["viewer"]).may_everywhere(Permission::Read) && Caller::local().may_everywhere(Permission::Reset)
+            holder(&["viewer"]).is_permitted_everywhere(Permission::Read)
+                && Caller::local().is_permitted_everywhere(Permission::Reset)
         );
     }
 
@@ -258,7 +259,7 @@ mod tests {
         let scanner = holder(&["scanner", "viewer@wall:7 8"]);
         assert_eq!(scanner.grants()[1].to_string(), "viewer@wall:7 8", "it is kept as it was");
         assert!(scanner.may_call(rule(Permission::Read, Object::List)).is_err());
-        assert!(!scanner.may_over(Permission::Read, &[area("packing")]));
+        assert!(!scanner.is_permitted_in(Permission::Read, &[area("packing")]));
         assert!(scanner.may_call(rule(Permission::Stop, Object::None)).is_ok());
     }
 

@@ -39,7 +39,7 @@ fn asked(caller: &Caller, path: &str, rule: Access, of: &AreaId) -> Result<(), R
     access::check(caller, path)?;
     match rule.permission {
         Permission::Anybody | Permission::Robot | Permission::SignedIn | Permission::Stop => Ok(()),
-        permission if has_areas(rule.object) => caller.needs(permission, [of]),
+        permission if has_areas(rule.object) => caller.authorize(permission, [of]),
         _ => Ok(()),
     }
 }

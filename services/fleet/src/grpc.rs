@@ -195,7 +195,7 @@ impl FleetService {
 
     async fn policy(&self, area_id: AreaId, by: &Caller) -> Result<v1::AreaPolicy, Refusal> {
         let id = area_id.clone();
-        if !by.may_over(Permission::Read, [&area_id]) {
+        if !by.is_permitted_in(Permission::Read, [&area_id]) {
             return Err(not_found(Code::AreaNotFound, area_id));
         }
         let found = self
@@ -295,7 +295,9 @@ impl FleetService {
         let of = |table| rows.iter().find(|row| row.key.table == table).ok_or_else(missing);
         let intake = of(Table::TaskIntake)?.decode::<TaskIntake>().ok();
         let areas = intake.map(|intake| self.site.areas_of_task(&intake.spec));
-        if !by.may_everywhere(Permission::Read) && !areas.is_some_and(|a| by.may_over(Permission::Read, &a)) {
+        if !by.is_permitted_everywhere(Permission::Read)
+            && !areas.is_some_and(|a| by.is_permitted_in(Permission::Read, &a))
+        {
             return Err(missing());
         }
         let row = of(Table::TaskState)?;

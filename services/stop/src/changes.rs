@@ -187,7 +187,7 @@ pub fn reset(inner: &Inner, stop_id: StopId, reason: String, by: &Caller) -> Res
     let mut engaged_stops = lock(&inner.engaged_stops);
     let areas =
         engaged_stops.latch().stop(&stop_id).map(|stop| inner.site_index.areas(&stop.scope)).unwrap_or_default();
-    if let Err(refusal) = by.needs(Permission::Reset, &areas) {
+    if let Err(refusal) = by.authorize(Permission::Reset, &areas) {
         let note = Note::by_actor(now.wall, Action::Denied, &by.into());
         let note = note.with("code", refusal.reason.code).with("asked", "stop.reset").with("stop_id", stop_id);
         inner.disk.denied(note, 0);

@@ -124,10 +124,10 @@ impl TaskService {
 
     fn dispatches(&self, spec: &TaskSpec, by: &Caller) -> Result<(), Refusal> {
         let dispatch = Permission::Dispatch;
-        if by.may_everywhere(dispatch) {
+        if by.is_permitted_everywhere(dispatch) {
             Ok(())
         } else {
-            by.needs(dispatch, &self.inner.parts.site.areas_of_task(spec))
+            by.authorize(dispatch, &self.inner.parts.site.areas_of_task(spec))
         }
     }
 

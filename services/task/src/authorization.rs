@@ -16,36 +16,41 @@ use std::collections::{BTreeMap, BTreeSet};
 
 impl TaskService {
     /// A task that a caller may do that to.
-    pub async fn to_act_on(&self, task_id: &TaskId, by: &Caller, permission: Permission) -> Result<TaskRows, Refusal> {
+    pub async fn read_authorized(
+        &self,
+        task_id: &TaskId,
+        by: &Caller,
+        permission: Permission,
+    ) -> Result<TaskRows, Refusal> {
         let task = read(self.store(), task_id).await?;
-        self.acts_on(&task, by, permission)?;
+        self.authorize_task(&task, by, permission)?;
         Ok(task)
     }
 
-    pub(crate) fn acts_on(&self, task: &TaskRows, by: &Caller, permission: Permission) -> Result<(), Refusal> {
-        if by.may_everywhere(permission) && by.may_everywhere(Permission::Read) {
+    pub(crate) fn authorize_task(&self, task: &TaskRows, by: &Caller, permission: Permission) -> Result<(), Refusal> {
+        if by.is_permitted_everywhere(permission) && by.is_permitted_everywhere(Permission::Read) {
             return Ok(());
         }
         let areas = self.inner.parts.site.areas_of_task(&task.intake.spec);
-        by.acts_on(permission, &areas, || not_found(&task.state.task_id))
+        by.authorize_visible(permission, &areas, || not_found(&task.state.task_id))
     }
 
     /// Whether a caller may let go what this names. A stop that is named alone means everywhere, and needs a right that holds there.
-    pub async fn may_resume(&self, ask: &Ask, by: &Caller) -> Result<(), Refusal> {
+    pub async fn authorize_resume(&self, ask: &Ask, by: &Caller) -> Result<(), Refusal> {
         let operate = Permission::Operate;
         let Ask::ResumeHeld { area_id, task_ids, robot_ids, .. } = ask else { return Ok(()) };
-        if by.may_everywhere(operate) {
+        if by.is_permitted_everywhere(operate) {
             return Ok(());
         }
         if area_id.is_none() && task_ids.is_empty() && robot_ids.is_empty() {
-            return by.needs(operate, []);
+            return by.authorize(operate, []);
         }
-        area_id.iter().try_for_each(|area_id| by.needs(operate, [area_id]))?;
+        area_id.iter().try_for_each(|area_id| by.authorize(operate, [area_id]))?;
         // With a task the robot goes on that works on it, wherever that stands.
         let mut robots: BTreeSet<RobotId> = robot_ids.iter().cloned().collect();
         let tasks = read_many(self.store(), task_ids).await?;
         for task in &tasks {
-            self.acts_on(task, by, operate)?;
+            self.authorize_task(task, by, operate)?;
             robots.extend(task.state.robot_id.clone());
         }
         // One that does not exist is answered as one that the caller may not see.
@@ -57,7 +62,7 @@ impl TaskService {
             return Ok(());
         }
         let areas = self.areas_of_robots().await?;
-        robots.iter().try_for_each(|robot_id| by.needs(operate, areas.get(robot_id).into_iter().flatten()))
+        robots.iter().try_for_each(|robot_id| by.authorize(operate, areas.get(robot_id).into_iter().flatten()))
     }
 
     /// The areas of the places that robots hold: here no heartbeat is heard. Of a robot that holds none nothing is known.

@@ -96,7 +96,7 @@ impl TaskService {
         let task_id = task_id.ok_or_else(internal)?;
         let same = v1::CancelTaskRequest { request_id: String::new(), validate_only: false, ..r.clone() };
         let hash = hash("cancel", &same);
-        let task = match self.to_act_on(&task_id, by, Permission::Dispatch).await {
+        let task = match self.read_authorized(&task_id, by, Permission::Dispatch).await {
             Err(refusal) if !r.validate_only => {
                 let ask = Ask::Cancel { task_id, force: r.force };
                 return Err(self.denied(ask, r.reason, request_id, by, refusal).await);
@@ -140,7 +140,7 @@ impl TaskService {
         let (Some(task_id), Some(resolution)) = (task_id, resolution) else { return Err(internal()) };
         let same = v1::ResolveTaskRequest { request_id: String::new(), validate_only: false, ..r.clone() };
         let hash = hash("resolve", &same);
-        let task = match self.to_act_on(&task_id, by, Permission::Operate).await {
+        let task = match self.read_authorized(&task_id, by, Permission::Operate).await {
             Err(refusal) if !r.validate_only => {
                 let ask = Ask::Resolve { task_id, resolution };
                 return Err(self.denied(ask, r.reason, request_id, by, refusal).await);

@@ -206,7 +206,7 @@ impl TaskService {
         let mut items = Vec::new();
         for task in tasks {
             count.matched += 1;
-            let refusal = self.acts_on(task, by, bulk.permission).and_then(|()| bulk.wish.fits(task)).err();
+            let refusal = self.authorize_task(task, by, bulk.permission).and_then(|()| bulk.wish.fits(task)).err();
             let own_id = bulk.request_id.as_ref().map(|id| format!("{id}/{}", task.state.task_id));
             let asked = PendingCommand {
                 ask: bulk.wish.to_ask(task),

@@ -86,7 +86,7 @@ impl TaskService {
         let request_id = request_id(&r.request_id, &mut bad);
         let ask = read(&r, |area| self.inner.parts.site.find_area(area).is_some(), &mut bad);
         bad.finish()?;
-        match self.may_resume(&ask, by).await {
+        match self.authorize_resume(&ask, by).await {
             Err(refusal) if !r.validate_only => return Err(self.denied(ask, r.reason, request_id, by, refusal).await),
             looked => looked?,
         }

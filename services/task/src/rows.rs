@@ -66,7 +66,8 @@ pub async fn read_for(store: &dyn Store, site: &Site, by: &Caller, task_id: &Tas
 
 /// Whether a caller may see a task: all areas of its goals.
 pub fn sees(site: &Site, by: &Caller, intake: &TaskIntake) -> bool {
-    by.may_everywhere(Permission::Read) || by.may_over(Permission::Read, &site.areas_of_task(&intake.spec))
+    by.is_permitted_everywhere(Permission::Read)
+        || by.is_permitted_in(Permission::Read, &site.areas_of_task(&intake.spec))
 }
 
 /// One task.
@@ -168,7 +169,7 @@ pub async fn are_seen(store: &dyn Store, site: &Site, by: &Caller, ids: &[TaskId
     let keys = ids.iter().map(|id| Key::new(Table::TaskIntake, id.as_str())).collect();
     let found = by_id(store, keys).await.map_err(unavailable)?;
     let seen = |row: &Row| -> Result<bool, BadRow> {
-        Ok(by.may_everywhere(Permission::Read) || sees(site, by, &row.decode::<TaskIntake>()?))
+        Ok(by.is_permitted_everywhere(Permission::Read) || sees(site, by, &row.decode::<TaskIntake>()?))
     };
     let seen = ids.iter().map(|id| found.get(id.as_str()).map_or(Ok(false), seen));
     seen.collect::<Result<_, BadRow>>().map_err(unavailable)

@@ -104,9 +104,9 @@ fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&NewestHeartbeat>) -> 
 
 /// Whether a caller may see a robot: where it is now, by its newest heartbeat.
 fn sees(inner: &Inner, by: &Caller, robot_id: &RobotId) -> bool {
-    by.may_everywhere(Permission::Read) || {
+    by.is_permitted_everywhere(Permission::Read) || {
         let live = inner.parts.board.get(robot_id);
-        by.may_over(Permission::Read, inner.projection.rows().area_of(live.as_deref()))
+        by.is_permitted_in(Permission::Read, inner.projection.rows().area_of(live.as_deref()))
     }
 }
 

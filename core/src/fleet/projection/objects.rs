@@ -38,23 +38,25 @@ pub fn areas_of_incident(view: &FleetProjection, board: &Board, incident: &Incid
 
 /// Whether a caller may see a robot.
 pub fn sees_robot(view: &FleetProjection, board: &Board, by: &Caller, robot_id: &RobotId) -> bool {
-    by.may_everywhere(Permission::Read) || by.may_over(Permission::Read, area_of(view, board, robot_id).as_ref())
+    by.is_permitted_everywhere(Permission::Read)
+        || by.is_permitted_in(Permission::Read, area_of(view, board, robot_id).as_ref())
 }
 
 /// Whether a caller may see an incident.
 pub fn sees_incident(view: &FleetProjection, board: &Board, by: &Caller, incident: &Incident) -> bool {
     let read = Permission::Read;
-    by.may_everywhere(read) || by.may_over(read, &areas_of_incident(view, board, incident))
+    by.is_permitted_everywhere(read) || by.is_permitted_in(read, &areas_of_incident(view, board, incident))
 }
 
 /// Whether a caller may see a place.
 pub fn sees_place(view: &FleetProjection, by: &Caller, place_id: &PlaceId) -> bool {
-    by.may_everywhere(Permission::Read) || by.may_over(Permission::Read, &view.site.areas_of_place(place_id))
+    by.is_permitted_everywhere(Permission::Read)
+        || by.is_permitted_in(Permission::Read, &view.site.areas_of_place(place_id))
 }
 
 /// Whether a caller may see a task.
 pub fn sees_task(view: &FleetProjection, by: &Caller, task_id: &TaskId) -> bool {
-    by.may_everywhere(Permission::Read) || by.may_over(Permission::Read, &areas_of_task(view, task_id))
+    by.is_permitted_everywhere(Permission::Read) || by.is_permitted_in(Permission::Read, &areas_of_task(view, task_id))
 }
 
 /// Whether a caller may do what it asks.
@@ -63,7 +65,7 @@ pub fn sees_task(view: &FleetProjection, by: &Caller, task_id: &TaskId) -> bool 
 /// It may not see what it is about, or may not do that to it.
 pub fn permit(view: &FleetProjection, board: &Board, by: &Caller, command: &Command) -> Result<(), Refusal> {
     let operate = Permission::Operate;
-    if by.may_everywhere(operate) && by.may_everywhere(Permission::Read) {
+    if by.is_permitted_everywhere(operate) && by.is_permitted_everywhere(Permission::Read) {
         return Ok(());
     }
     let missing = |code: Code, key: &str, id: &dyn ToString| {
@@ -82,23 +84,23 @@ pub fn permit(view: &FleetProjection, board: &Board, by: &Caller, command: &Comm
                 return Ok(());
             }
             let area = area_of(view, board, robot_id);
-            by.acts_on(operate, area.as_ref(), || missing(Code::RobotNotFound, "robot_id", robot_id))
+            by.authorize_visible(operate, area.as_ref(), || missing(Code::RobotNotFound, "robot_id", robot_id))
         }
         Command::PutPolicy(policy) => {
             let area_id = &policy.area_id;
-            by.acts_on(operate, [area_id], || missing(Code::AreaNotFound, "area_id", area_id))
+            by.authorize_visible(operate, [area_id], || missing(Code::AreaNotFound, "area_id", area_id))
         }
         Command::ClearPlace { place_id, .. } => {
             if !view.places.contains_key(place_id.as_str()) {
                 return Ok(());
             }
             let areas = view.site.areas_of_place(place_id);
-            by.acts_on(operate, &areas, || missing(Code::PlaceNotFound, "place_id", place_id))
+            by.authorize_visible(operate, &areas, || missing(Code::PlaceNotFound, "place_id", place_id))
         }
         Command::CloseIncident { incident_id, .. } => {
             let Some(incident) = view.incidents.get(incident_id) else { return Ok(()) };
             let areas = areas_of_incident(view, board, &incident.row);
-            by.acts_on(operate, &areas, || missing(Code::IncidentNotFound, "incident_id", incident_id))
+            by.authorize_visible(operate, &areas, || missing(Code::IncidentNotFound, "incident_id", incident_id))
         }
     }
 }

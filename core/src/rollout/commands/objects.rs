@@ -18,13 +18,13 @@ fn missing(code: Code, key: &str, id: &impl ToString) -> Refusal {
 
 /// Whether a caller may see a roll-out: each area that it is for. One that names none is the site's.
 pub fn sees(by: &Caller, rollout: &Rollout) -> bool {
-    by.may_over(Permission::Read, &rollout.spec.selector.areas)
+    by.is_permitted_in(Permission::Read, &rollout.spec.selector.areas)
 }
 
 /// Whether a caller may see a robot.
 pub fn sees_robot(view: &RolloutProjection, board: &Board, by: &Caller, robot_id: &RobotId) -> bool {
     let area = || board.get(robot_id).and_then(|live| view.area_of(live));
-    by.may_everywhere(Permission::Read) || by.may_over(Permission::Read, area().as_ref())
+    by.is_permitted_everywhere(Permission::Read) || by.is_permitted_in(Permission::Read, area().as_ref())
 }
 
 /// A roll-out that a caller may see.
@@ -36,7 +36,7 @@ pub fn find_seen<'v>(view: &'v RolloutProjection, by: &Caller, rollout_id: &Roll
     found.ok_or_else(|| missing(Code::RolloutNotFound, "rollout_id", rollout_id))
 }
 
-fn acts_on(
+fn authorize_rollout(
     view: &RolloutProjection,
     by: &Caller,
     permission: Permission,
@@ -44,7 +44,7 @@ fn acts_on(
 ) -> Result<(), Refusal> {
     let Some(rollout) = view.rollout(rollout_id) else { return Ok(()) };
     let areas = &rollout.spec.selector.areas;
-    by.acts_on(permission, areas, || missing(Code::RolloutNotFound, "rollout_id", rollout_id))
+    by.authorize_visible(permission, areas, || missing(Code::RolloutNotFound, "rollout_id", rollout_id))
 }
 
 /// Whether a caller may do what it asks.
@@ -56,48 +56,48 @@ pub fn permit(view: &RolloutProjection, board: &Board, by: &Caller, command: &Co
     match command {
         Command::Create { spec, .. } => {
             let areas = &spec.selector.areas;
-            by.needs(author, areas)?;
+            by.authorize(author, areas)?;
             // Another right than to write one: many robots meet a bad bundle before a gate has seen it.
-            if spec.allow_full_push { by.needs(Permission::Push, areas) } else { Ok(()) }
+            if spec.allow_full_push { by.authorize(Permission::Push, areas) } else { Ok(()) }
         }
-        Command::Rollback { of, .. } => acts_on(view, by, author, of),
+        Command::Rollback { of, .. } => authorize_rollout(view, by, author, of),
         Command::Do { rollout_id, verb: Verb::Approve, .. } => {
-            acts_on(view, by, Permission::Approve, rollout_id)?;
-            needs_another_person(view, by, rollout_id)
+            authorize_rollout(view, by, Permission::Approve, rollout_id)?;
+            require_another_person(view, by, rollout_id)
         }
         Command::Do { rollout_id, verb, .. } => {
-            acts_on(view, by, author, rollout_id)?;
+            authorize_rollout(view, by, author, rollout_id)?;
             match verb {
                 // Whoever ends others' roll-outs for its own must be allowed to end them.
-                Verb::Start { supersede: true } if !by.may_everywhere(author) => {
+                Verb::Start { supersede: true } if !by.is_permitted_everywhere(author) => {
                     let others = find_superseded(view, board, rollout_id);
                     others
                         .iter()
                         .filter_map(|id| view.rollout(id))
-                        .try_for_each(|r| by.needs(author, &r.spec.selector.areas))
+                        .try_for_each(|r| by.authorize(author, &r.spec.selector.areas))
                 }
                 _ => Ok(()),
             }
         }
-        Command::Revoke { .. } => by.needs(author, []),
+        Command::Revoke { .. } => by.authorize(author, []),
         Command::Pin { robot_id, .. } | Command::Unpin { robot_id } | Command::Unstick { robot_id, .. } => {
             if !view.sessions.contains_key(robot_id.as_str()) {
                 return Ok(());
             }
-            acts_on_robot(view, board, by, robot_id, Code::RobotNotFound)
+            authorize_robot(view, board, by, robot_id, Code::RobotNotFound)
         }
         // Which machine is which robot is for whoever administers the site.
-        Command::AcceptKey { .. } => by.needs(Permission::Administer, []),
+        Command::AcceptKey { .. } => by.authorize(Permission::Administer, []),
         Command::LiftQuarantine { robot_id, bundle } => {
             if !view.quarantines.contains_key(&Quarantine::id_of(robot_id, bundle)) {
                 return Ok(());
             }
-            acts_on_robot(view, board, by, robot_id, Code::QuarantineNotFound)
+            authorize_robot(view, board, by, robot_id, Code::QuarantineNotFound)
         }
     }
 }
 
-fn acts_on_robot(
+fn authorize_robot(
     view: &RolloutProjection,
     board: &Board,
     by: &Caller,
@@ -105,11 +105,11 @@ fn acts_on_robot(
     code: Code,
 ) -> Result<(), Refusal> {
     let area = board.get(robot_id).and_then(|live| view.area_of(live));
-    by.acts_on(Permission::Author, area.as_ref(), || missing(code, "robot_id", robot_id))
+    by.authorize_visible(Permission::Author, area.as_ref(), || missing(code, "robot_id", robot_id))
 }
 
 /// Refuses a person that wrote the roll-out itself. Where nobody signs in there is nobody else.
-fn needs_another_person(view: &RolloutProjection, by: &Caller, rollout_id: &RolloutId) -> Result<(), Refusal> {
+fn require_another_person(view: &RolloutProjection, by: &Caller, rollout_id: &RolloutId) -> Result<(), Refusal> {
     let Some(rollout) = view.rollout(rollout_id) else { return Ok(()) };
     if matches!(by.principal(), Principal::Local) || rollout.created.person() != by.person() {
         return Ok(());

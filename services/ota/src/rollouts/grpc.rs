@@ -193,7 +193,7 @@ impl RolloutService {
                 }
                 None => objects::find_seen(view, &by, &rollout_id)?.spec.clone(),
             };
-            by.needs(Permission::Author, &spec.selector.areas)?;
+            by.authorize(Permission::Author, &spec.selector.areas)?;
             let run = dry_run(view, board, &rollout_id, &spec)?;
             Ok(encode::plan(&run, spec.waves.len()))
         })
