@@ -202,7 +202,7 @@ impl Event {
 
 /// Where a task stands when an event arrives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Standing {
+pub struct MachineState {
     /// Its phase.
     pub phase: Phase,
     /// Its attempt is UNCERTAIN.
@@ -311,7 +311,7 @@ fn after_drop(facts: &Facts) -> Phase {
 }
 
 /// The table. `None`: the event means nothing there (fenced, duplicate, too late) and is counted, not obeyed.
-pub fn next(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
+pub fn next(at: MachineState, event: Event, facts: &Facts) -> Option<Next> {
     if at.phase.is_terminal() {
         return None;
     }
@@ -336,11 +336,11 @@ fn stop(then: AfterStopping) -> Option<Next> {
     Some(Next { phase: Phase::Stopping, then: Some(then), action: AttemptAction::Stop })
 }
 
-fn stay(at: Standing) -> Option<Next> {
+fn stay(at: MachineState) -> Option<Next> {
     Some(Next { phase: at.phase, then: at.then, action: AttemptAction::Keep })
 }
 
-fn waiting(at: Standing, event: Event) -> Option<Next> {
+fn waiting(at: MachineState, event: Event) -> Option<Next> {
     match (at.phase, event) {
         (Phase::Queued, Event::PlanOffers) => go(Phase::Assigned, AttemptAction::Keep),
         (Phase::Queued | Phase::RetryWait, Event::ScheduleToStart) => go(Phase::NeedsOperator, AttemptAction::Keep),
@@ -352,7 +352,7 @@ fn waiting(at: Standing, event: Event) -> Option<Next> {
     }
 }
 
-fn assigned(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
+fn assigned(at: MachineState, event: Event, facts: &Facts) -> Option<Next> {
     let work = if facts.held { Phase::Held } else { Phase::Running };
     match event {
         Event::Accepted | Event::Progress | Event::SeenRunning => go(work, AttemptAction::Keep),
@@ -373,7 +373,7 @@ fn assigned(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
     }
 }
 
-fn running(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
+fn running(at: MachineState, event: Event, facts: &Facts) -> Option<Next> {
     let too_long = if facts.retry_wanted { AfterStopping::Retry } else { AfterStopping::Failed };
     match event {
         Event::Accepted | Event::Progress | Event::SeenRunning => stay(at),
@@ -394,7 +394,7 @@ fn running(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
     }
 }
 
-fn stopping(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
+fn stopping(at: MachineState, event: Event, facts: &Facts) -> Option<Next> {
     let then = at.then.unwrap_or(AfterStopping::NeedsOperator);
     match event {
         Event::Succeeded => go(Phase::Succeeded, AttemptAction::End),
@@ -419,7 +419,7 @@ fn stopping(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
     }
 }
 
-fn uncertain(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
+fn uncertain(at: MachineState, event: Event, facts: &Facts) -> Option<Next> {
     let wish = |then| Some(Next { phase: at.phase, then: Some(then), action: AttemptAction::Keep });
     let known = |phase| Some(Next { phase, then: at.then, action: AttemptAction::Known });
     let too_long = if facts.retry_wanted { AfterStopping::Retry } else { AfterStopping::Failed };
@@ -454,7 +454,7 @@ fn uncertain(at: Standing, event: Event, facts: &Facts) -> Option<Next> {
     }
 }
 
-fn needs_operator(at: Standing, event: Event) -> Option<Next> {
+fn needs_operator(at: MachineState, event: Event) -> Option<Next> {
     match event {
         Event::Succeeded => go(Phase::Succeeded, AttemptAction::End),
         Event::StopConfirmed => Some(Next { action: AttemptAction::End, ..stay(at)? }),

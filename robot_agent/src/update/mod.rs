@@ -16,4 +16,4 @@ mod updater;
 pub use crate::storage::{DueMigration, HeldKeys, SoftwareRow, Update};
 pub use jobs::{Done, Failure, Job};
 pub use updater::UpdateConfig;
-pub(crate) use updater::{Bad, Standing, Updater};
+pub(crate) use updater::{Integrity, IntegrityFault, Updater};

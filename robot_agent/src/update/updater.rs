@@ -31,19 +31,19 @@ pub struct UpdateConfig {
 
 /// Whether what runs is what was signed and committed.
 #[derive(Debug, Default)]
-pub(crate) enum Standing {
+pub(crate) enum Integrity {
     /// Nobody has looked yet.
     #[default]
     Unknown,
     /// It is.
     Holds,
     /// It is not.
-    Bad(Bad),
+    Bad(IntegrityFault),
 }
 
 /// What runs is not what was signed and committed.
 #[derive(Debug)]
-pub(crate) struct Bad {
+pub(crate) struct IntegrityFault {
     pub(crate) reason: Reason,
     /// Failures to have its bytes anew.
     pub(crate) tries: u32,
@@ -108,7 +108,7 @@ pub(crate) struct Updater {
     /// When the disk was looked at last without an update under way.
     pub(crate) looked: Option<LinkTime>,
     /// Whether what runs is what was signed and committed.
-    pub(crate) standing: Standing,
+    pub(crate) integrity: Integrity,
     /// When its files were last begun to be read.
     pub(crate) read_at: Option<LinkTime>,
     /// Those that are to be read still.

@@ -1,6 +1,6 @@
 //! Why a task is not running and why a robot has no work: the planner's own filters, run again for one of them. Stores nothing.
 
-use super::standing;
+use super::wait_reasons;
 use crate::fleet::assignment::filters;
 use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::facts::misreads;
@@ -91,7 +91,7 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
             why
         })
     };
-    let verdict = standing::of_task(view, board, now, task, intake).or_else(|| waits.then(turn));
+    let verdict = wait_reasons::of_task(view, board, now, task, intake).or_else(|| waits.then(turn));
     let verdict = verdict.or_else(|| task.reason.clone());
     Some(TaskExplanation { position, verdict, candidates, filtered })
 }
@@ -111,7 +111,7 @@ pub fn per_turn(robots: usize) -> usize {
 /// A task that is not in the projection: how it ended, or that the planner has not read it yet.
 pub fn stored(task: &TaskState) -> TaskExplanation {
     let unread = || Reason::from(Code::WaitingInQueue).with(WAITS_FOR, "the planner: it has not read the task yet");
-    let verdict = Some(if task.phase.is_terminal() { standing::ended(task) } else { unread() });
+    let verdict = Some(if task.phase.is_terminal() { wait_reasons::ended(task) } else { unread() });
     TaskExplanation { position: None, verdict, candidates: Vec::new(), filtered: BTreeMap::new() }
 }
 
@@ -171,7 +171,7 @@ pub fn robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotI
         view.sessions.get(robot_id.as_str())?;
     }
     if let Err(unread) = view.unknown_rows.check_robot(robot_id) {
-        let verdict = Some(standing::about_robot(unread, robot_id));
+        let verdict = Some(wait_reasons::about_robot(unread, robot_id));
         return Some(RobotExplanation { verdict, candidates: Vec::new() });
     }
     let at = board.get(robot_id).and_then(|l| routing::find(view, l.report.vitals.waypoint.as_ref()));
@@ -195,8 +195,8 @@ pub fn robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotI
         let closed: Option<Vec<&Reason>> = candidates.iter().map(|c| barring(c.reason.as_ref())).collect();
         closed.and_then(|closed| closed.first().copied().cloned())
     };
-    let verdict = refused.or_else(|| standing::of_robot(view, board, now, robot_id)).or_else(kept).or_else(barred);
-    let verdict = verdict.map(|why| standing::about_robot(why, robot_id));
+    let verdict = refused.or_else(|| wait_reasons::of_robot(view, board, now, robot_id)).or_else(kept).or_else(barred);
+    let verdict = verdict.map(|why| wait_reasons::about_robot(why, robot_id));
     Some(RobotExplanation { verdict, candidates })
 }
 

@@ -3,7 +3,7 @@
 //! Called once a sweep. Each time it looks at some robots with work and at some tasks, and goes on where it ended. Invariant: what stands
 //! without a reason for [`limits::UNEXPLAINED_AFTER`] is counted once, until it has a reason again.
 
-use super::standing;
+use super::wait_reasons;
 use crate::fleet::assignment::filters;
 use crate::fleet::decision::plan::Plan;
 use crate::fleet::projection::liveness::Board;
@@ -22,7 +22,7 @@ pub(in crate::fleet) fn count_unexplained(view: &mut FleetProjection, board: &Bo
     for id in &robots {
         let Ok(robot_id) = RobotId::parse(id) else { continue };
         let has_work = view.held_by(&robot_id).is_some();
-        let why = standing::of_robot(view, board, &now, &robot_id).is_some_and(|why| standing::is_told(&why));
+        let why = wait_reasons::of_robot(view, board, &now, &robot_id).is_some_and(|why| wait_reasons::is_told(&why));
         found.push((format!("robot {id}"), !has_work || why));
     }
     let tasks = next(&view.tasks, &view.unexplained.task);
@@ -64,8 +64,8 @@ fn next<R>(rows: &BTreeMap<String, R>, last: &str) -> Vec<String> {
 /// A task has a reason, or waits for robots that all have one against it: none that is idle could take it.
 fn is_explained(view: &FleetProjection, board: &Board, now: &Now, task: &TaskState, idle: &[&RobotId]) -> bool {
     let Some(intake) = view.intake(&task.task_id) else { return true };
-    match standing::of_task(view, board, now, task, intake) {
-        Some(why) => standing::is_told(&why),
+    match wait_reasons::of_task(view, board, now, task, intake) {
+        Some(why) => wait_reasons::is_told(&why),
         None if task.phase != Phase::Queued => false,
         None => idle.iter().all(|robot_id| filters::pair(view, board, robot_id, task, intake, now).is_err()),
     }

@@ -15,7 +15,7 @@ use crate::robot::FaultClass;
 use crate::robot::WorkState;
 use crate::robot_events::AttemptReport;
 use crate::step::Effect;
-use crate::task::machine::{AttemptAction, Facts, Next, Standing, next};
+use crate::task::machine::{AttemptAction, Facts, MachineState, Next, next};
 use crate::task::state::Uncertain;
 use crate::task::{AfterStopping, Attempt, AttemptPhase, Event, Phase, TaskIntake, TaskState};
 
@@ -47,7 +47,7 @@ pub fn apply_event(tx: &mut Tx, task_id: &TaskId, news: News) -> bool {
     let news = News { report: opens.as_ref().or(news.report), ..news };
     let facts = facts(tx, &task, &intake, attempt.as_ref(), &news);
     let uncertain = attempt.as_ref().is_some_and(|a| a.uncertain.is_some());
-    let at = Standing { phase: task.phase, uncertain, then: task.then };
+    let at = MachineState { phase: task.phase, uncertain, then: task.then };
     let Some(step) = next(at, news.event, &facts) else { return false };
     let attempt = attempt.filter(|a| !a.phase.is_terminal() || a.phase == AttemptPhase::Lost);
     let attempt = attempt.map(|a| move_attempt(tx, a, step, &news, &intake));

@@ -151,7 +151,7 @@ impl Rig {
     /// Why a task is where it is.
     fn why(&self, task_id: &TaskId) -> Option<Reason> {
         let (task, intake) = self.view.task(task_id).zip(self.view.intake(task_id)).expect("a task");
-        super::explanation::standing::of_task(&self.view, &self.board, &self.now, task, intake)
+        super::explanation::wait_reasons::of_task(&self.view, &self.board, &self.now, task, intake)
     }
 
     fn task(&self, id: &str) -> &TaskState {

@@ -1,7 +1,7 @@
 //! What stands without a reason is counted; what has one is not.
 
 use super::{BEGIN, Rig};
-use crate::fleet::explanation::{standing, unexplained};
+use crate::fleet::explanation::{unexplained, wait_reasons};
 use crate::fleet::projection::RevisedRow;
 use crate::fleet::rows::Cordon;
 use crate::fleet::{Pace, Plan};
@@ -46,7 +46,7 @@ fn a_task_whose_robots_all_have_a_reason_against_them_is_not_counted() {
     rig.view.control.insert("r1".into(), RevisedRow { revision: Revision(9), row: control });
     assert_eq!(counted(&mut rig, 40), Vec::<String>::new());
     let told = crate::fleet::explain::robot(&rig.view, &rig.board, &rig.now, &robot_id).expect("known").verdict;
-    assert!(told.as_ref().is_some_and(standing::is_told), "{told:?}");
+    assert!(told.as_ref().is_some_and(wait_reasons::is_told), "{told:?}");
 }
 
 #[test]
@@ -67,8 +67,8 @@ fn an_attempt_of_a_robot_that_was_given_away_without_a_record_is_counted() {
 fn each_reason_against_a_robot_names_whom_it_waits_for() {
     let robot_id = RobotId::parse("r1").expect("an id");
     for code in Code::ALL {
-        let told = standing::about_robot(Reason::from(*code), &robot_id);
-        assert!(standing::is_told(&told), "{told:?}");
+        let told = wait_reasons::about_robot(Reason::from(*code), &robot_id);
+        assert!(wait_reasons::is_told(&told), "{told:?}");
     }
 }
 

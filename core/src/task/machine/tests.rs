@@ -61,18 +61,18 @@ fn all_facts() -> impl Iterator<Item = Facts> {
     })
 }
 
-fn all_standings() -> impl Iterator<Item = Standing> {
+fn all_standings() -> impl Iterator<Item = MachineState> {
     let thens: Vec<Option<AfterStopping>> = std::iter::once(None).chain(THENS.map(Some)).collect();
     Phase::ALL.into_iter().flat_map(move |phase| {
         let thens = thens.clone();
-        [false, true]
-            .into_iter()
-            .flat_map(move |uncertain| thens.clone().into_iter().map(move |then| Standing { phase, uncertain, then }))
+        [false, true].into_iter().flat_map(move |uncertain| {
+            thens.clone().into_iter().map(move |then| MachineState { phase, uncertain, then })
+        })
     })
 }
 
 /// Standings that a task can be in: `then` only while it stops or nobody knows.
-fn reachable() -> impl Iterator<Item = Standing> {
+fn reachable() -> impl Iterator<Item = MachineState> {
     all_standings().filter(|s| match (s.phase, s.uncertain) {
         (Phase::Stopping, _) => s.then.is_some(),
         (phase, true) => phase.has_attempt(),
@@ -95,7 +95,7 @@ fn event_named(name: &str) -> Event {
     Event::ALL.into_iter().find(|e| snake(&format!("{e:?}")) == name).unwrap_or_else(|| panic!("no event {name}"))
 }
 
-fn standing_named(name: &str) -> Standing {
+fn standing_named(name: &str) -> MachineState {
     let (uncertain, name) = name.strip_prefix('?').map_or((false, name), |rest| (true, rest));
     let (phase, then) = name.split_once('(').map_or((name, None), |(p, t)| (p, Some(t.trim_end_matches(')'))));
     let then = then.map(|t| {
@@ -103,7 +103,7 @@ fn standing_named(name: &str) -> Standing {
         named.unwrap_or_else(|| panic!("no then {t}"))
     });
     let phase = Phase::ALL.into_iter().find(|p| p.as_str() == phase).unwrap_or_else(|| panic!("no phase {phase}"));
-    Standing { phase, uncertain, then }
+    MachineState { phase, uncertain, then }
 }
 
 fn facts_named(names: &str) -> Facts {
@@ -128,20 +128,20 @@ fn facts_named(names: &str) -> Facts {
     f
 }
 
-fn shown(at: Standing) -> String {
+fn shown(at: MachineState) -> String {
     let then = at.then.map(|t| format!("({})", snake(&format!("{t:?}")).to_uppercase())).unwrap_or_default();
     format!("{}{}{then}", if at.uncertain { "?" } else { "" }, at.phase.as_str())
 }
 
 /// Where the task and its attempt's certainty stand after `next`, and the fate, in the words of the golden list.
-fn outcome(at: Standing, next: Option<Next>) -> (String, String) {
+fn outcome(at: MachineState, next: Option<Next>) -> (String, String) {
     let Some(next) = next else { return (".".to_owned(), String::new()) };
     let uncertain = match next.action {
         AttemptAction::Uncertain => true,
         AttemptAction::Known | AttemptAction::End | AttemptAction::Abandon => false,
         AttemptAction::Keep | AttemptAction::Stop => at.uncertain && next.phase.has_attempt(),
     };
-    let after = Standing { phase: next.phase, uncertain, then: next.then };
+    let after = MachineState { phase: next.phase, uncertain, then: next.then };
     (shown(after), format!("{:?}", next.action).to_lowercase())
 }
 
@@ -188,7 +188,7 @@ fn every_cell_of_the_golden_list_is_what_the_table_says() {
 }
 
 /// Cells differ by `then` and, among uncertain ones, by phase only in where they come back to: the list stands for all of them.
-fn listed_as(at: Standing) -> String {
+fn listed_as(at: MachineState) -> String {
     match (at.uncertain && at.phase.has_attempt(), at.phase) {
         (true, _) => "?RUNNING".to_owned(),
         (false, phase) => phase.as_str().to_owned(),
@@ -227,7 +227,7 @@ fn the_golden_list_has_each_of_the_109_pairs_of_the_design() {
 
 #[test]
 fn the_table_answers_every_corner_and_never_with_a_broken_standing() {
-    let reachable: Vec<Standing> = reachable().collect();
+    let reachable: Vec<MachineState> = reachable().collect();
     for at in all_standings() {
         for event in Event::ALL {
             for facts in all_facts() {
@@ -272,7 +272,7 @@ fn no_timeout_frees_an_attempt() {
 fn stopping_ends_by_the_robots_word_by_a_person_and_without_either() {
     for then in THENS {
         for uncertain in [false, true] {
-            let at = Standing { phase: Phase::Stopping, uncertain, then: Some(then) };
+            let at = MachineState { phase: Phase::Stopping, uncertain, then: Some(then) };
             let silence = if uncertain { Event::UncertainTimeout } else { Event::StopConfirmTimeout };
             for event in [Event::StopConfirmed, Event::Succeeded, Event::CancelForce, silence] {
                 for facts in all_facts() {
@@ -299,7 +299,7 @@ fn a_hold_and_its_end_lose_no_wish() {
 
 #[test]
 fn a_wish_that_stands_is_answered_whatever_the_robot_reports() {
-    let at = |phase, uncertain| Standing { phase, uncertain, then: Some(AfterStopping::Canceled) };
+    let at = |phase, uncertain| MachineState { phase, uncertain, then: Some(AfterStopping::Canceled) };
     for phase in [Phase::Running, Phase::Held, Phase::Stopping] {
         for event in [Event::Refused, Event::FailedRecoverable, Event::FailedFinal, Event::StopConfirmed] {
             for facts in all_facts() {

@@ -14,7 +14,7 @@ use crate::launcher::switch::{FACTORY, Switch};
 use crate::sets::Holdings;
 use crate::storage::proven::{Committed, Proven};
 use crate::storage::{Op, SoftwareRow, Update};
-use crate::update::{Bad, Job, Standing};
+use crate::update::{Integrity, IntegrityFault, Job};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::manifest::Migration;
 use midshift_bundle::release::Release;
@@ -51,13 +51,13 @@ fn repaired(switch: &Switch, committed: Committed) -> Switch {
 impl AgentCore {
     /// Whether work may be done with what runs. A robot whose software is not changed has nothing to hold it against.
     pub(crate) fn runs_what_was_signed(&self) -> bool {
-        self.update.config.is_none() || matches!(self.update.standing, Standing::Holds)
+        self.update.config.is_none() || matches!(self.update.integrity, Integrity::Holds)
     }
 
     /// Why work is not taken with what runs.
     pub(crate) fn software_refusal(&self) -> Option<Reason> {
-        match &self.update.standing {
-            Standing::Bad(bad) => Some(bad.reason.clone()),
+        match &self.update.integrity {
+            Integrity::Bad(bad) => Some(bad.reason.clone()),
             _ => (!self.runs_what_was_signed()).then(|| Code::InMaintenance.into()),
         }
     }
@@ -161,7 +161,7 @@ impl AgentCore {
     pub(super) fn holds_as_it_came(&mut self, holdings: Option<&Holdings>) {
         let is_factory = holdings.is_some_and(|holdings| holdings.switch.running() == FACTORY);
         if is_factory && self.proven().committed.current == FACTORY {
-            self.update.standing = Standing::Holds;
+            self.update.integrity = Integrity::Holds;
         }
     }
 
@@ -170,11 +170,11 @@ impl AgentCore {
         if self.update.leaves.is_some_and(|number| holdings.switch.number > number) {
             return Next::Ends(ExitReason::Switched);
         }
-        match &self.update.standing {
-            Standing::Holds => Next::GoesOn,
-            Standing::Bad(_) => self.remedy(now, holdings),
-            Standing::Unknown if self.ends_anyway(&holdings.switch) => self.end_beside_an_update(holdings),
-            Standing::Unknown => match self.held(holdings) {
+        match &self.update.integrity {
+            Integrity::Holds => Next::GoesOn,
+            Integrity::Bad(_) => self.remedy(now, holdings),
+            Integrity::Unknown if self.ends_anyway(&holdings.switch) => self.end_beside_an_update(holdings),
+            Integrity::Unknown => match self.held(holdings) {
                 Ok(Some(set)) => {
                     self.ask_for(Job::Check { set: set.id(), file: PROGRAM.to_owned() });
                     Next::Waits
@@ -226,14 +226,14 @@ impl AgentCore {
 
     /// A file of the set that runs has the bytes that were signed.
     pub(super) fn checked(&mut self, file: &str) {
-        if file == PROGRAM && matches!(self.update.standing, Standing::Unknown) {
+        if file == PROGRAM && matches!(self.update.integrity, Integrity::Unknown) {
             self.acquit();
         }
     }
 
     /// What runs holds. A robot that was stuck with it is so no more.
     fn acquit(&mut self) {
-        self.update.standing = Standing::Holds;
+        self.update.integrity = Integrity::Holds;
         let software = self.memory.ledger.software.clone();
         let is_ours = |u: &Update| u.reason.as_ref().is_some_and(|reason| reason.code == Code::RunningSetBad);
         let stuck = software.update.clone().filter(|u| u.state == UpdateState::Stuck && is_ours(u));
@@ -252,7 +252,7 @@ impl AgentCore {
             Some(UpdateState::Switching | UpdateState::Committing | UpdateState::RollingBack | UpdateState::Stuck)
         );
         let Ok(id) = holdings.switch.running().parse::<Digest>() else { return };
-        if changes || !matches!(self.update.standing, Standing::Holds) {
+        if changes || !matches!(self.update.integrity, Integrity::Holds) {
             return;
         }
         if self.update.read_at.is_none_or(|at| now.link.since(at) >= READ_EVERY) {
@@ -270,13 +270,14 @@ impl AgentCore {
         tracing::error!(robot_id = %self.config.robot_id, reason = reason.name(), why = reason.text(), "what runs is not what was signed and committed");
         let message = format!("{}: {}", reason.name(), reason.text()).chars().take(200).collect();
         self.fault_changed(Fault { code: FAULT_SOFTWARE, class: FaultClass::Mechanical, message }, true);
-        self.update.standing = Standing::Bad(Bad { reason, tries: 0, is_given_up: false, is_mended: false });
+        self.update.integrity =
+            Integrity::Bad(IntegrityFault { reason, tries: 0, is_given_up: false, is_mended: false });
     }
 
     // --- what follows if it does not hold
 
     fn remedy(&mut self, now: &Now, holdings: &Holdings) -> Next {
-        let Standing::Bad(bad) = &self.update.standing else { return Next::GoesOn };
+        let Integrity::Bad(bad) = &self.update.integrity else { return Next::GoesOn };
         let (reason, is_given_up, is_mended) = (bad.reason.clone(), bad.is_given_up, bad.is_mended);
         let update = self.memory.ledger.software.update.clone();
         let state = update.as_ref().map(|u| u.state);
@@ -323,14 +324,14 @@ impl AgentCore {
 
     /// The committed set lies there as it was signed: it is started anew.
     pub(super) fn mended(&mut self) {
-        if let Standing::Bad(bad) = &mut self.update.standing {
+        if let Integrity::Bad(bad) = &mut self.update.integrity {
             bad.is_mended = true;
         }
     }
 
     /// Its bytes cannot be had now.
     pub(super) fn not_mended(&mut self) {
-        if let Standing::Bad(bad) = &mut self.update.standing {
+        if let Integrity::Bad(bad) = &mut self.update.integrity {
             bad.tries += 1;
             bad.is_given_up |= bad.tries >= MEND_TRIES_MAX;
         }
@@ -338,7 +339,7 @@ impl AgentCore {
 
     /// Its bytes cannot be had.
     pub(super) fn give_up_mending(&mut self) {
-        if let Standing::Bad(bad) = &mut self.update.standing {
+        if let Integrity::Bad(bad) = &mut self.update.integrity {
             bad.is_given_up = true;
         }
     }
