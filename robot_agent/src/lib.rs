@@ -29,4 +29,4 @@ pub use midshift_os::clock;
 pub use program::{Config, environment, launcher_heartbeat, run};
 pub use storage::{device, ledger, memory, ring, sqlite, store};
 pub use transport::{bulk, dial, enrolment, replay, tls};
-pub use update::trust;
+pub use update::trust_anchors;

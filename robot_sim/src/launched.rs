@@ -13,7 +13,7 @@ use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::sets::{self, Holdings, Sets};
 use midshift_agent::start_policy::{self, Tries};
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_agent::update::UpdateConfig;
 use midshift_agent::update::io::UpdateWorker;
 use midshift_agent::update::remote::GrpcRemote;
@@ -130,7 +130,7 @@ impl Launched {
     ///
     /// # Errors
     /// Sets that cannot be opened.
-    pub fn updates(&self, trust: &Trust, bulk: Bulk) -> Result<Updates, sets::Error> {
+    pub fn updates(&self, trust: &TrustAnchors, bulk: Bulk) -> Result<Updates, sets::Error> {
         let config = UpdateConfig { is_launched: true, ..trust.config() };
         let worker = UpdateWorker::new(self.storage.open()?, Arc::new(GrpcRemote::new(bulk)));
         Ok(Updates { config, worker: Box::new(worker) })

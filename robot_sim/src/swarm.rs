@@ -21,7 +21,7 @@ use midshift_agent::stop::line::StopLine;
 use midshift_agent::stop::storage::{FileStops, MemoryStops, STOP_FILE, StopStorage};
 use midshift_agent::store::{self, Store};
 use midshift_agent::tls::Tls;
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_core::Boxed;
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::robot::StopLevel;
@@ -111,7 +111,7 @@ pub struct SwarmConfig {
     /// Which tasks a person leaves to their robots; none: nobody walks about.
     pub person: Option<IsTaskLive>,
     /// What they believe of software; none: theirs is not changed.
-    pub software: Option<Trust>,
+    pub software: Option<TrustAnchors>,
 }
 
 impl SwarmConfig {

@@ -5,7 +5,7 @@
 use crate::child::Child;
 use anyhow::{Context, bail, ensure};
 use midshift_agent::sets::FileRef;
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_bundle::build;
 use midshift_bundle::folder::{Folder, Signed};
 use midshift_bundle::keys::SecretKey;
@@ -73,10 +73,10 @@ impl Releases {
         self.dir.join("keys")
     }
     /// What robots of the demo site believe of it.
-    pub fn trust(&self) -> anyhow::Result<Trust> {
+    pub fn trust(&self) -> anyhow::Result<TrustAnchors> {
         let root = self.folder.document("1.root.json")?.context("the repository has no root")?;
         let key = SecretKey::read(&self.keys().join("directive-1.pem"))?.public();
-        Ok(Trust { root, directive_keys: [(key.id(), key)].into(), site: text::parse(DEMO)?.site_id().clone() })
+        Ok(TrustAnchors { root, directive_keys: [(key.id(), key)].into(), site: text::parse(DEMO)?.site_id().clone() })
     }
     /// Builds and signs a bundle whose one file is so many bytes of noise. `number` is its version and decides the bytes.
     pub fn add(&mut self, number: u64, bytes: u64) -> anyhow::Result<Release> {

@@ -2,7 +2,7 @@
 
 use crate::child::Child;
 use anyhow::Context;
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::folder::Folder;
 use midshift_bundle::keys::{PublicKey, SecretKey};
@@ -44,10 +44,10 @@ impl People {
         Ok(SecretKey::read(&self.keys.join("directive-1.pem"))?.public())
     }
     /// What robots of a site believe.
-    pub fn trust(&self, site: SiteId) -> anyhow::Result<Trust> {
+    pub fn trust(&self, site: SiteId) -> anyhow::Result<TrustAnchors> {
         let root = Folder::open(&self.repository)?.document("1.root.json")?.context("a repository without a root")?;
         let key = self.directive_key()?;
-        Ok(Trust { root, directive_keys: [(key.id(), key)].into(), site })
+        Ok(TrustAnchors { root, directive_keys: [(key.id(), key)].into(), site })
     }
     /// Brings all of it to a server that has nothing.
     pub async fn push(&self, server: &Child) -> anyhow::Result<()> {

@@ -1,6 +1,6 @@
 //! Real agents with simulated bodies that take software: what `sim run` starts, and what each needs to change its set.
 
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_core::time::Clock;
 use midshift_sim::faults::FaultRates;
 use midshift_sim::fleet::{Fleet, FleetConfig};
@@ -34,7 +34,7 @@ pub async fn run(args: SwarmArgs, stop: CancellationToken) -> anyhow::Result<()>
     let hall = Arc::new(Fleet::open(&config, &clock.now())?);
     let uri = midshift_cli::endpoint::uri(&args.server);
     let mut swarm = SwarmConfig::tcp(hall, clock, &uri, SEED);
-    swarm.software = Some(Trust::read(&args.trust)?);
+    swarm.software = Some(TrustAnchors::read(&args.trust)?);
     Swarm::new(swarm).run(stop).await?;
     Ok(())
 }

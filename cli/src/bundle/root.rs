@@ -5,7 +5,7 @@ use crate::client::Exit;
 use crate::out::{Format, Out, columns};
 use clap::{Subcommand, ValueEnum};
 use midshift_agent::clock;
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_bundle::folder::{Error, Folder, Signed, WaitingRoot};
 use midshift_bundle::keys::{KeyId, PublicKey, SecretKey};
 use midshift_bundle::repository::RootDraft;
@@ -276,7 +276,7 @@ pub fn trust(repository: &Path, directive: &[PathBuf], site: &str, into: &Path, 
     let (version, root) = folder.root()?;
     let ids: Vec<KeyId> = directive_keys.iter().map(PublicKey::id).collect();
     let directive_keys = directive_keys.into_iter().map(|key| (key.id(), key)).collect();
-    Trust { root, directive_keys, site }.write(into).map_err(|e| Exit::new(2, e.to_string()))?;
+    TrustAnchors { root, directive_keys, site }.write(into).map_err(|e| Exit::new(2, e.to_string()))?;
     let names: Vec<String> = ids.iter().map(ToString::to_string).collect();
     print_json(&serde_json::json!({"file": into, "rootVersion": version, "directiveKeys": names}), out);
     out.inform(&format!(

@@ -88,7 +88,7 @@ fn what_robots_are_given_has_the_newest_root_and_a_key_whose_orders_they_take() 
     let key = SecretKey::read(&place.path("keys/root-1.pem")).expect("a key");
     assert_eq!(folder.sign_root(&[&key], &[]).expect("signed"), Signed::Published(2));
     write(&[place.path("keys/directive-1.pem")]).expect("written");
-    let trust = midshift_agent::trust::Trust::read(&into).expect("a robot reads it");
+    let trust = midshift_agent::trust_anchors::TrustAnchors::read(&into).expect("a robot reads it");
     let directive = SecretKey::read(&place.path("keys/directive-1.pem")).expect("a key").public();
     assert_eq!(trust.directive_keys.into_values().collect::<Vec<_>>(), [directive]);
     assert!(String::from_utf8_lossy(&trust.root).contains("\"version\":2"), "a newer one than it began with");

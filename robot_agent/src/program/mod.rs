@@ -26,7 +26,7 @@ use crate::transport::enrolment::{self, Enrolled, Identity, Invitation};
 use crate::update::UpdateConfig;
 use crate::update::io::UpdateWorker;
 use crate::update::remote::GrpcRemote;
-use crate::update::trust::{self, Trust};
+use crate::update::trust_anchors::{self, TrustAnchors};
 use midshift_core::ids::{self, RobotId};
 use midshift_core::stop::PORT;
 use midshift_core::time::Clock;
@@ -183,7 +183,7 @@ pub enum Error {
     Dial(#[from] dial::Error),
     /// The trust file.
     #[error(transparent)]
-    Trust(#[from] trust::Error),
+    Trust(#[from] trust_anchors::Error),
     /// The sets of software.
     #[error(transparent)]
     Sets(#[from] sets::Error),
@@ -204,7 +204,7 @@ pub enum Error {
 /// The software of a robot: its sets, whom it trusts, and which set runs. The launcher names that one, else the switch
 /// record does.
 pub struct Software {
-    trust: Trust,
+    trust: TrustAnchors,
     sets: DiskSets,
     holdings: Holdings,
     running: String,
@@ -212,7 +212,7 @@ pub struct Software {
 }
 
 impl Software {
-    fn open(folder: &Path, trust: Trust) -> Result<Self, Error> {
+    fn open(folder: &Path, trust: TrustAnchors) -> Result<Self, Error> {
         let mut sets = DiskSets::open(folder)?;
         let told = std::env::var(launcher::SET).ok();
         if let Some(set) = &told {
@@ -228,7 +228,7 @@ impl Software {
     }
 
     /// Whose software it takes.
-    pub const fn trust(&self) -> &Trust {
+    pub const fn trust(&self) -> &TrustAnchors {
         &self.trust
     }
 
@@ -304,7 +304,7 @@ impl Machine {
         };
         let trust = config.trust.clone().or(trust_of_site(data, identity.as_ref())?);
         let software = config.sets.as_deref().zip(trust.as_deref());
-        let software = software.map(|(sets, trust)| Software::open(sets, Trust::read(trust)?)).transpose()?;
+        let software = software.map(|(sets, trust)| Software::open(sets, TrustAnchors::read(trust)?)).transpose()?;
         Ok(Self { config, robot_id, clock, store, new_ring_id, identity, software })
     }
 

@@ -41,7 +41,7 @@ mod successor;
 mod test_body;
 mod thief;
 mod told_time;
-mod trusts;
+mod trust_anchors;
 mod twins;
 mod updates;
 mod way_back;

@@ -21,7 +21,7 @@ use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::stop::storage::{FileStops, STOP_FILE, StopStorage, unreadable};
 use midshift_agent::storage::Proven;
 use midshift_agent::store::{Op, RobotMemory, Store};
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_agent::update::{DueMigration, HeldKeys, SoftwareRow, Update};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::keys::SecretKey;
@@ -308,11 +308,11 @@ fn trust_and_certificate_that_a_newer_version_wrote_are_read() {
     let path = folder.path().join("trust.json");
     let config = Releases::new().config();
     let site = SiteId::parse("hall-1").expect("a name");
-    let trust = Trust { root: config.root, directive_keys: config.directive_keys, site };
+    let trust = TrustAnchors { root: config.root, directive_keys: config.directive_keys, site };
     trust.write(&path).expect("writes");
-    let before = Trust::read(&path).expect("reads");
+    let before = TrustAnchors::read(&path).expect("reads");
     adds_a_field(&path);
-    assert_eq!(Trust::read(&path).expect("reads"), before);
+    assert_eq!(TrustAnchors::read(&path).expect("reads"), before);
     let home = folder.path().join("identity");
     let enrolled = Enrolled {
         robot_id: RobotId::parse("rbt-01").expect("a name"),

@@ -5,7 +5,7 @@ use crate::release::{Releases, SIGNED};
 use crate::rig::Rig;
 use crate::session::{Desk, Seen, clock, config};
 use crate::test_body::TestBody;
-use crate::trusts::Metadata;
+use crate::trust_anchors::Metadata;
 use midshift_agent::bulk::Bulk;
 use midshift_agent::dial::TcpDial;
 use midshift_agent::memory::MemoryStore;

@@ -20,7 +20,7 @@ pub use args::Dev;
 
 use anyhow::{Context, bail};
 use greeting::greeting;
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_cli::roles::Roles;
 use midshift_cli::site_file::{self, Loaded};
 use midshift_core::Boxed;
@@ -195,7 +195,7 @@ impl Scene {
         hall: &Fleet,
         sight: Sight,
         [address, stops]: [SocketAddr; 2],
-        trust: Trust,
+        trust: TrustAnchors,
         software: &Throwaway,
     ) -> anyhow::Result<(Stage, TempDir)> {
         let in_process = args.robots - self.launched;

@@ -12,7 +12,7 @@ pub use played::Story;
 
 use anyhow::{Context, ensure};
 use midshift_agent::switch::Switch;
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_cli::samples::{self, Signer};
 use midshift_core::ids::{AreaId, RobotId, WaypointId};
 use midshift_proto::fleet::v1::GetAreaPolicyRequest;
@@ -113,7 +113,7 @@ pub struct Stage {
     /// Robots to launch, and where each starts.
     pub launched: Vec<(RobotId, WaypointId)>,
     /// Whom they believe.
-    pub trust: Trust,
+    pub trust: TrustAnchors,
     /// The repository to sign in, and its targets key.
     pub repository: (PathBuf, PathBuf),
     /// Decides bodies.

@@ -3,7 +3,7 @@
 //! Invariant: nothing here is used by `serve`; a key of a real release never comes here.
 
 use anyhow::Context;
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_bundle::folder::Folder;
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::repository::Profile;
@@ -42,10 +42,10 @@ impl Throwaway {
         self.dir.path().join("repository")
     }
     /// What robots of `site` believe of it.
-    pub fn trust(&self, site: SiteId) -> anyhow::Result<Trust> {
+    pub fn trust(&self, site: SiteId) -> anyhow::Result<TrustAnchors> {
         let root = Folder::open(&self.repository())?.document("1.root.json")?.context("the repository has no root")?;
         let key = SecretKey::read(&self.keys().join("directive-1.pem"))?.public();
-        Ok(Trust { root, directive_keys: [(key.id(), key)].into(), site })
+        Ok(TrustAnchors { root, directive_keys: [(key.id(), key)].into(), site })
     }
     /// All its keys.
     pub fn keys(&self) -> PathBuf {

@@ -4,7 +4,7 @@
 
 use anyhow::ensure;
 use midshift_agent::program::{Pulse, Software};
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_core::site::Site;
 use midshift_core::time::{Clock, LinkDuration};
 use midshift_sim::behaviour::{Behaviour, COMPONENT};
@@ -13,13 +13,13 @@ use std::path::Path;
 use std::sync::Arc;
 
 /// Reads the trust file of robots of `site`. An error if it is for those of another one.
-pub fn trust_of(file: &Path, site: &Site) -> anyhow::Result<Trust> {
-    let trust = Trust::read(file)?;
+pub fn trust_of(file: &Path, site: &Site) -> anyhow::Result<TrustAnchors> {
+    let trust = TrustAnchors::read(file)?;
     of_site(&trust, site)?;
     Ok(trust)
 }
 
-fn of_site(trust: &Trust, site: &Site) -> anyhow::Result<()> {
+fn of_site(trust: &TrustAnchors, site: &Site) -> anyhow::Result<()> {
     let (of, this) = (&trust.site, site.site_id());
     ensure!(of == this, "the trust file is for robots of site {of}; this is site {this}");
     Ok(())

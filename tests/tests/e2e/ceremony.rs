@@ -6,7 +6,7 @@ use crate::harness::{Server, command, midshift, sign_in};
 use crate::secrets::heard;
 use crate::tuf::{draft, python};
 use anyhow::{Context, ensure};
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_bundle::keys::{PublicKey, SecretKey};
 use midshift_core::site::{DEMO, text as site_text};
 use std::path::Path;
@@ -77,7 +77,7 @@ async fn the_runbook_of_keys_is_followed_from_their_making_through_the_loss_of_e
         follow(dir, None, block)?;
     }
     let key = |name: &str| PublicKey::read(&dir.join("public").join(name));
-    let first = Trust::read(&dir.join("trust.json"))?;
+    let first = TrustAnchors::read(&dir.join("trust.json"))?;
     assert_eq!(first.directive_keys.into_values().collect::<Vec<_>>(), [key("directive-1.pem")?]);
 
     let keys = dir.join("server-keys");
@@ -98,7 +98,7 @@ async fn the_runbook_of_keys_is_followed_from_their_making_through_the_loss_of_e
     story_of_server_keys(dir, &mut server, "A directive key is stolen or ends").await?;
     assert_eq!(believes(&server)?, ["root 5, targets 6"]);
 
-    let trust = Trust::read(&dir.join("trust.json"))?;
+    let trust = TrustAnchors::read(&dir.join("trust.json"))?;
     let held = SecretKey::read(&keys.join("directive-2.pem"))?.public();
     assert_eq!(trust.directive_keys.into_values().collect::<Vec<_>>(), [held], "the stolen key is not among them");
     let root: serde_json::Value = serde_json::from_slice(&trust.root)?;

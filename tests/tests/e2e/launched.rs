@@ -9,7 +9,7 @@ use midshift_agent::sets::{FileRef, Sets};
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::store::{Op, Store};
 use midshift_agent::switch::{FACTORY, Fallen, Switch};
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_agent::update::{SoftwareRow, Update};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::keys::SecretKey;
@@ -74,7 +74,7 @@ impl Machine {
         let draft = RootDraft { version: 1, expires, root: one(), targets: one(), snapshot: one(), timestamp: one() };
         let root = sign_root(&draft, &[&key])?;
         let directive_keys = [key.public()].into_iter().map(|k| (k.id(), k)).collect();
-        Trust { root, directive_keys, site: machine.site.clone() }.write(&machine.path("trust.json"))?;
+        TrustAnchors { root, directive_keys, site: machine.site.clone() }.write(&machine.path("trust.json"))?;
         Ok(machine)
     }
     fn path(&self, name: &str) -> PathBuf {
@@ -295,7 +295,7 @@ fn sets_and_trust_go_together_and_a_trust_file_of_another_site_is_refused() -> a
     for half in [vec!["--sets", &*sets], vec!["--trust", &*trust], vec!["--clock-unsynced"]] {
         assert_eq!(run(&half)?.0, Some(2), "{half:?}");
     }
-    let mut foreign = Trust::read(&machine.path("trust.json"))?;
+    let mut foreign = TrustAnchors::read(&machine.path("trust.json"))?;
     foreign.site = SiteId::parse("elsewhere")?;
     foreign.write(&machine.path("trust.json"))?;
     let (code, said) = run(&["--sets", &sets, "--trust", &trust])?;

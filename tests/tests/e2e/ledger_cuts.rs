@@ -13,7 +13,7 @@ use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::store::Store;
 use midshift_agent::switch::{FACTORY, Switch};
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::keys::SecretKey;
 use midshift_cli::samples::{Signer, make};
@@ -119,7 +119,7 @@ impl Station {
         let site = text::parse(DEMO)?.site_id().clone();
         let robot = home.path().join("robot");
         fs::create_dir(&robot)?;
-        Trust { root, directive_keys: [(key.id(), key)].into(), site }.write(&robot.join("trust.json"))?;
+        TrustAnchors { root, directive_keys: [(key.id(), key)].into(), site }.write(&robot.join("trust.json"))?;
         let mut command = Command::new(midshift()?);
         command.arg("launcher").arg("--record").arg(robot.join("tries")).arg("--sets").arg(robot.join("sets"));
         command.args(["--", "sh", "-c", &script(&robot), "sh"]).arg(midshift()?);

@@ -12,7 +12,7 @@ use midshift_agent::launcher::SWITCH;
 use midshift_agent::sets::Sets;
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::switch::{FACTORY, Switch};
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_bundle::keys::SecretKey;
 use midshift_core::site::{DEMO, Site, text};
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
@@ -176,10 +176,10 @@ pub async fn until_known(people: &str, id: &str, home: &Path) -> anyhow::Result<
 }
 
 /// What a robot of `site` believes that believes the release people of `samples`.
-pub fn trust(samples: &Path, site: &Site) -> anyhow::Result<Trust> {
+pub fn trust(samples: &Path, site: &Site) -> anyhow::Result<TrustAnchors> {
     let key = SecretKey::read(&samples.join("keys/directive-1.pem"))?.public();
     let root = std::fs::read(samples.join("repository/metadata/1.root.json"))?;
-    Ok(Trust { root, directive_keys: [(key.id(), key)].into(), site: site.site_id().clone() })
+    Ok(TrustAnchors { root, directive_keys: [(key.id(), key)].into(), site: site.site_id().clone() })
 }
 
 /// The command line.

@@ -5,7 +5,7 @@ use anyhow::Context;
 use async_trait::async_trait;
 use hyper_util::rt::TokioIo;
 use midshift_agent::dial::{self, Cut, Dial};
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_bundle::build;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::directive::{Directive, LIFE_MS};
@@ -152,10 +152,10 @@ async fn publish(channel: Channel, made: &Made) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn trust(made: &Made, keys: &Path, hall: &FleetConfig) -> anyhow::Result<Trust> {
+fn trust(made: &Made, keys: &Path, hall: &FleetConfig) -> anyhow::Result<TrustAnchors> {
     let root = Folder::open(&made.repository)?.document("1.root.json")?.context("no root")?;
     let key = SecretKey::read(&keys.join("directive-1.pem"))?.public();
-    Ok(Trust { root, directive_keys: [(key.id(), key)].into(), site: hall.site.site_id().clone() })
+    Ok(TrustAnchors { root, directive_keys: [(key.id(), key)].into(), site: hall.site.site_id().clone() })
 }
 
 impl Bench {

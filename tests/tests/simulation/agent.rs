@@ -17,7 +17,7 @@ use midshift_agent::core::ExitReason;
 use midshift_agent::memory::MemoryStore as RobotMemoryStore;
 use midshift_agent::session::{self, AgentConfig, Lines, Updates};
 use midshift_agent::start_policy::HANG_SECONDS;
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_core::robot::StopLevel;
 use midshift_core::time::Clock;
 use midshift_sim::handle::SimHandle;
@@ -53,7 +53,7 @@ pub struct Agent {
     /// Its sets, and who starts them.
     pub launched: Arc<Launched>,
     /// What it believes.
-    pub trust: Trust,
+    pub trust: TrustAnchors,
     /// Naive rules.
     pub bugs: Bugs,
     /// Which of its programs are of the next version; none: nobody asks.

@@ -3,7 +3,7 @@
 //! Invariant: nothing is drawn and no wall clock is read, so that the same seed signs the same directives.
 
 use anyhow::Context;
-use midshift_agent::trust::Trust;
+use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::keys::{PublicKey, SecretKey};
 use midshift_bundle::manifest::{Component, ComponentKind, FORMAT, Manifest};
@@ -39,7 +39,7 @@ pub const BAD_WITH_LOAD: &str = "1.6.2-bad-with-load";
 pub struct Software {
     dir: TempDir,
     /// What robots believe.
-    pub trust: Trust,
+    pub trust: TrustAnchors,
     /// Content of each signed bundle, by its digest.
     pub signed: BTreeMap<Digest, BTreeSet<Digest>>,
     /// Bundles by version.
@@ -100,7 +100,7 @@ impl Software {
             .collect();
         let targets = sign_targets(None, &add, &[], expires, &[&key(2)])?;
         let directive_keys = [key(5).public()].map(|key: PublicKey| (key.id(), key)).into();
-        let trust = Trust { root: root.clone(), directive_keys, site };
+        let trust = TrustAnchors { root: root.clone(), directive_keys, site };
         let this = Self { dir, trust, signed, bundles };
         let runtime = tokio::runtime::Builder::new_current_thread().build()?;
         runtime.block_on(this.publish(root, targets, files, now))?;

@@ -21,7 +21,7 @@ const DIRECTIVE_KEYS_MAX: usize = 8;
 
 /// What a robot believes before it has heard anything.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Trust {
+pub struct TrustAnchors {
     /// The first root of the repository of its site. The robot finds newer ones from there.
     pub root: Vec<u8>,
     /// Keys whose directives it takes.
@@ -63,7 +63,7 @@ struct Page {
     site: String,
 }
 
-impl Trust {
+impl TrustAnchors {
     /// Reads a file.
     ///
     /// # Errors

@@ -1,7 +1,7 @@
 //! The file of what a robot believes from the day it was set up.
 
 use crate::release::{Releases, SIGNED};
-use midshift_agent::trust::{Error, Trust};
+use midshift_agent::trust_anchors::{Error, TrustAnchors};
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::trust::{Reading, Source, Trusted};
 use midshift_core::ids::SiteId;
@@ -20,10 +20,10 @@ impl Source for Metadata {
     }
 }
 
-fn trust(releases: &Releases) -> Trust {
+fn trust(releases: &Releases) -> TrustAnchors {
     let config = releases.config();
     let site = SiteId::parse("hall-1").expect("a name");
-    Trust { root: config.root, directive_keys: config.directive_keys, site }
+    TrustAnchors { root: config.root, directive_keys: config.directive_keys, site }
 }
 
 #[tokio::test]
@@ -33,7 +33,7 @@ async fn what_was_written_is_what_a_robot_believes() {
     let releases = Releases::new();
     releases.release("1.0.0");
     trust(&releases).write(&path).expect("writes");
-    let read = Trust::read(&path).expect("reads");
+    let read = TrustAnchors::read(&path).expect("reads");
     assert_eq!((&read.directive_keys, read.site.as_str()), (&releases.config().directive_keys, "hall-1"));
     let config = read.config();
     assert!(config.clock_synced && !config.is_launched && !config.allows_safety_related);
@@ -42,7 +42,7 @@ async fn what_was_written_is_what_a_robot_believes() {
     let refreshed = Trusted::new(&config.root).expect("a root").refresh(source, clock).await.expect("is believed");
     assert_eq!(refreshed.targets.len(), 3);
     read.write(&path).expect("writes");
-    assert_eq!(Trust::read(&path).expect("reads"), read, "writing it again changes nothing");
+    assert_eq!(TrustAnchors::read(&path).expect("reads"), read, "writing it again changes nothing");
 }
 
 #[test]
@@ -55,7 +55,7 @@ fn a_file_is_refused_with_all_that_is_wrong_with_it() {
         let mut page = good.clone();
         change(&mut page);
         fs::write(&path, page.to_string()).expect("writes");
-        match Trust::read(&path) {
+        match TrustAnchors::read(&path) {
             Err(Error::Refused { refusal, .. }) => refusal.violations.into_iter().map(|v| v.field).collect::<Vec<_>>(),
             other => panic!("{other:?}"),
         }
@@ -77,10 +77,10 @@ fn a_file_that_no_robot_would_take_is_not_written() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("trust.json");
     let good = trust(&Releases::new());
-    let nobody = Trust { directive_keys: Default::default(), ..good.clone() };
+    let nobody = TrustAnchors { directive_keys: Default::default(), ..good.clone() };
     assert!(matches!(nobody.write(&path), Err(Error::Refused { .. })));
-    let rootless = Trust { root: b"{}".to_vec(), ..good };
+    let rootless = TrustAnchors { root: b"{}".to_vec(), ..good };
     assert!(matches!(rootless.write(&path), Err(Error::Refused { .. })));
     assert!(!path.exists());
-    assert!(matches!(Trust::read(&path), Err(Error::Io { .. })));
+    assert!(matches!(TrustAnchors::read(&path), Err(Error::Io { .. })));
 }
