@@ -30,7 +30,7 @@ pub struct Trial {
 
 /// A set that the launcher put away because its program could not live.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Fallen {
+pub struct FailedTrial {
     /// Its name.
     pub set: String,
     /// Starts that it was given.
@@ -49,7 +49,7 @@ pub struct Switch {
     /// Runs instead of `current`.
     pub trial: Option<Trial>,
     /// Put away by the launcher; stays until the next trial.
-    pub fallen: Option<Fallen>,
+    pub fallen: Option<FailedTrial>,
 }
 
 impl Default for Switch {
@@ -106,7 +106,7 @@ impl Switch {
     }
     /// The trial could not live: the launcher's [`Switch::go_back`].
     pub fn fall_back(&mut self, tries: u32) {
-        self.fallen = self.trial.take().map(|trial| Fallen { set: trial.set, tries });
+        self.fallen = self.trial.take().map(|trial| FailedTrial { set: trial.set, tries });
     }
 
     /// Reads a record, or its copy where it is missing or torn. Neither is there: what a robot came with.
@@ -154,7 +154,7 @@ impl Switch {
         })?;
         let fallen = optional(lines.get("fallen")?, |text| {
             let (set, tries) = text.split_once(' ')?;
-            Some(Fallen { set: set_name(set)?, tries: tries.parse().ok()? })
+            Some(FailedTrial { set: set_name(set)?, tries: tries.parse().ok()? })
         })?;
         Some(Self { number, current, previous, trial, fallen })
     }

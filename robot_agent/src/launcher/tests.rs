@@ -141,7 +141,7 @@ fn a_set_on_trial_that_cannot_live_is_put_away_and_the_one_before_it_runs() {
     assert_eq!(ran(&folder), ["v1", "v1", "factory"]);
     let after = record(&orders);
     assert_eq!((after.running(), after.trial.as_ref()), ("factory", None));
-    assert_eq!(after.fallen, Some(switch::Fallen { set: "v1".to_owned(), tries: TRIES_MAX }));
+    assert_eq!(after.fallen, Some(switch::FailedTrial { set: "v1".to_owned(), tries: TRIES_MAX }));
 }
 
 #[test]
@@ -271,7 +271,7 @@ fn a_set_is_put_away_though_the_switch_record_cannot_be_written_and_stays_so_whi
     assert_eq!(ran(&folder), ["v1", "v1", "factory", "factory"], "it is not tried once more");
     let after = record(&orders);
     assert_eq!((after.number, after.running()), (2, "factory"), "it was written when there was room");
-    assert_eq!(after.fallen, Some(switch::Fallen { set: "v1".to_owned(), tries: TRIES_MAX }));
+    assert_eq!(after.fallen, Some(switch::FailedTrial { set: "v1".to_owned(), tries: TRIES_MAX }));
 }
 
 #[test]
@@ -312,7 +312,7 @@ fn a_program_that_cannot_be_looked_at_is_not_taken_for_one_that_the_set_does_not
     on_trial(&orders, "v1");
     keep_running(&orders).expect("runs");
     assert_eq!(ran(&folder), ["factory"], "its program ran as no other set");
-    assert_eq!(record(&orders).fallen, Some(switch::Fallen { set: "v1".to_owned(), tries: TRIES_MAX }));
+    assert_eq!(record(&orders).fallen, Some(switch::FailedTrial { set: "v1".to_owned(), tries: TRIES_MAX }));
 }
 
 #[test]
@@ -330,7 +330,7 @@ fn tries_that_cannot_be_read_speak_against_a_set_on_probation_and_against_no_oth
         keep_running(&orders).expect("runs");
     }
     assert_eq!(ran(&folder), ["v1", "factory", "factory"]);
-    assert_eq!(record(&orders).fallen, Some(switch::Fallen { set: "v1".to_owned(), tries: TRIES_MAX }));
+    assert_eq!(record(&orders).fallen, Some(switch::FailedTrial { set: "v1".to_owned(), tries: TRIES_MAX }));
 }
 
 #[test]

@@ -6,7 +6,7 @@ use midshift_agent::launcher::{PROGRAM, SWITCH};
 use midshift_agent::sets::Sets;
 use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::start_policy::TRIES_MAX;
-use midshift_agent::switch::{FACTORY, Fallen, Switch};
+use midshift_agent::switch::{FACTORY, FailedTrial, Switch};
 use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fs;
@@ -66,7 +66,7 @@ fn an_agent_that_was_started_from_the_kept_set_takes_the_trial_for_put_away_and_
     assert_eq!(sets.holdings().expect("tells").switch.running(), name, "nothing was put away");
     sets.started_from(FACTORY).expect("tells");
     let mut switch = sets.holdings().expect("tells").switch;
-    let fallen = Some(Fallen { set: name.clone(), tries: TRIES_MAX });
+    let fallen = Some(FailedTrial { set: name.clone(), tries: TRIES_MAX });
     assert_eq!((switch.running(), &switch.fallen), (FACTORY, &fallen));
     sets.collect(&BTreeSet::new()).expect("collects");
     assert!(folder.path().join(&name).exists(), "the record on the disk names it still");

@@ -8,7 +8,7 @@ use midshift_agent::sets::disk::DiskSets;
 use midshift_agent::sets::{FileRef, Sets};
 use midshift_agent::sqlite::SqliteStore;
 use midshift_agent::store::{Op, Store};
-use midshift_agent::switch::{FACTORY, Fallen, Switch};
+use midshift_agent::switch::{FACTORY, FailedTrial, Switch};
 use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_agent::update::{SoftwareRow, Update};
 use midshift_bundle::digest::Digest;
@@ -181,7 +181,7 @@ async fn put_away(behaviour: &str) -> anyhow::Result<String> {
     let (said, switch) = (text_of(&machine.log()), record(&machine)?);
     anyhow::ensure!(code == Some(0), "the launcher ended with {code:?}: {said}");
     anyhow::ensure!(switch.running() == FACTORY, "{switch:?}: {said}");
-    anyhow::ensure!(switch.fallen == Some(Fallen { set: name, tries: 2 }), "{switch:?}: {said}");
+    anyhow::ensure!(switch.fallen == Some(FailedTrial { set: name, tries: 2 }), "{switch:?}: {said}");
     Ok(said)
 }
 
