@@ -35,8 +35,8 @@ impl AgentCore {
         self.take_news(&now);
         let yields = self.config.bugs.stop_yields_to_disk() && self.writes.in_flight.is_some();
         match &input {
-            Input::Stop(news) if !yields => self.hear_stop(&now, StopNews::clone(news)),
-            Input::Down(down) => self.hear_stop_beside(&now, down),
+            Input::Stop(news) if !yields => self.apply_stop_news(&now, StopNews::clone(news)),
+            Input::Down(down) => self.apply_stops_of_link(&now, down),
             _ => {}
         }
         self.obey(&now);

@@ -52,7 +52,7 @@ impl AgentCore {
         self.stop.as_ref().map(|stop| stop.awaiting()).unwrap_or_default()
     }
 
-    pub(crate) fn hear_stop(&mut self, now: &Now, mut news: StopNews) {
+    pub(crate) fn apply_stop_news(&mut self, now: &Now, mut news: StopNews) {
         if let StopNews::Facts { resets, .. } = &mut news
             && self.config.bugs.reset_clears_all()
             && let Some(reset) = resets.first().cloned()
@@ -66,16 +66,16 @@ impl AgentCore {
     }
 
     /// What the link says of stops; one that has no stop line obeys none.
-    pub(crate) fn hear_stop_beside(&mut self, now: &Now, down: &Downlink) {
+    pub(crate) fn apply_stops_of_link(&mut self, now: &Now, down: &Downlink) {
         if let Some(why) = &down.unreadable_stops {
             tracing::error!(robot_id = %self.config.robot_id, why, "stops on the link cannot be read: what is latched stays");
         }
         let Some(facts) = down.stops.clone() else { return };
         if self.config.bugs.reset_clears_all() {
             let StopFacts { stops, resets } = facts;
-            self.hear_stop(now, StopNews::Facts { stops, resets, generation: 0 });
+            self.apply_stop_news(now, StopNews::Facts { stops, resets, generation: 0 });
         } else if let Some(stop) = &mut self.stop {
-            stop.take_link_facts(facts);
+            stop.merge_link_facts(facts);
         }
     }
 

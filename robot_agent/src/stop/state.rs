@@ -185,7 +185,7 @@ impl StopState {
 
     /// Adds what the link brings of stops: the second way, for one whose own line is cut. It feeds no ladder and ends
     /// no wait for the first words on that line.
-    pub(crate) fn take_link_facts(&mut self, facts: StopFacts) {
+    pub(crate) fn merge_link_facts(&mut self, facts: StopFacts) {
         let key = self.saved().key.clone();
         let is_changed = self.robot.merge_relayed(facts.stops, facts.resets, |reset| is_marked(&key, reset));
         self.changed(is_changed);
