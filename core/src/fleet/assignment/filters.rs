@@ -3,7 +3,7 @@
 //! Invariant: a filter gives a reason; nothing is ever "just not chosen".
 
 use crate::energy::Trip;
-use crate::fleet::facts::{answers, disbelief, maps, repair};
+use crate::fleet::facts::{disbelief, maps, repair, unanswered_offers};
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::queue::Wait;
 use crate::fleet::projection::rows::RobotHolder;
@@ -62,7 +62,7 @@ pub fn robot(view: &FleetProjection, board: &Board, robot_id: &RobotId, now: &No
     if !current {
         return Err(Code::RobotReconciling.into());
     }
-    answers::check_answering(view, robot_id, now)?;
+    unanswered_offers::check_answering(view, robot_id, now)?;
     if routing::find(view, live.report.vitals.waypoint.as_ref()).is_none() {
         return Err(Code::RobotUnlocated.into());
     }

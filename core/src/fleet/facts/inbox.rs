@@ -3,7 +3,7 @@
 //! Invariant: a report counts only for the newest epoch of its task; older ones are fenced and counted, never obeyed.
 
 use super::holds::apply_hardware_stop;
-use super::{answers, disbelief};
+use super::{disbelief, unanswered_offers};
 use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::decision::report::Tally;
@@ -36,7 +36,7 @@ pub fn obey_entry(tx: &mut Tx, entry: &InboxEntry, board: &Board, tally: &mut Ta
         RobotEvent::Attempt(report) => {
             breaker::count_let_go(tx, robot_id, report);
             if calls_offer_over(tx.view, robot_id, report) {
-                answers::note_refused_offer(tx, robot_id, report);
+                unanswered_offers::note_refused_offer(tx, robot_id, report);
             }
             apply_attempt_report(tx, robot_id, report, tally);
         }
@@ -74,9 +74,9 @@ pub fn apply_attempt_report(tx: &mut Tx, robot_id: &RobotId, report: &AttemptRep
     let id = &report.attempt;
     let is_offer = tx.view.attempt(id).is_some_and(|a| a.accepted.is_none() && a.robot_id == *robot_id);
     if is_offer && report.state == WorkState::Refused {
-        answers::note_refused_offer(tx, robot_id, report);
+        unanswered_offers::note_refused_offer(tx, robot_id, report);
     } else if is_offer && !matches!(report.state, WorkState::Aborted | WorkState::Suspended) {
-        answers::note_answer(tx, robot_id);
+        unanswered_offers::note_answer(tx, robot_id);
     }
     if let Some(why) = plausible::judge(tx.view, id, robot_id, report.state, report.step_index) {
         return disbelief::doubt(tx, robot_id, id, &why);

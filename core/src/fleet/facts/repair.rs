@@ -3,7 +3,7 @@
 //! Invariant: repair never overtakes events. A difference counts only if the robot has applied the newest desired work and every
 //! EVENT and CRITICAL number it had produced has been consumed. The end of a lease frees authority, never a load or a place.
 
-use super::{answers, disbelief, holds, inbox, maps};
+use super::{disbelief, holds, inbox, maps, unanswered_offers};
 use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::decision::report::Tally;
@@ -174,7 +174,7 @@ fn repair_attempt(tx: &mut Tx, robot_id: &RobotId, live: &NewestHeartbeat, tally
     match listed {
         None => {
             if is_unanswered(tx.view, &a, live) {
-                answers::note_missed_offer(tx, robot_id);
+                unanswered_offers::note_missed_offer(tx, robot_id);
             }
             is_over(tx, &report(WorkState::Aborted));
         }
@@ -186,7 +186,7 @@ fn repair_attempt(tx: &mut Tx, robot_id: &RobotId, live: &NewestHeartbeat, tally
             apply_event(tx, task_id, News { event: Event::StepUnknown, why: None, report: Some(&report) });
         }
         Some(l) if needs_sight(&a, live) => {
-            answers::note_answer(tx, robot_id);
+            unanswered_offers::note_answer(tx, robot_id);
             let Some(task_id) = id.subject.task_id() else { return errand_reports::note_heard(tx, robot_id) };
             tally.repaired += 1;
             let report = report(l.state);

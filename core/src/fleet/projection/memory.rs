@@ -18,7 +18,7 @@ pub struct Agenda {
 
 /// What is remembered of offers that were not answered. Volatile.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Answers {
+pub struct UnansweredOffers {
     /// Robots by when they last missed an offer, link clock.
     pub(in crate::fleet) missed: BTreeMap<RobotId, LinkTime>,
     /// Offers that a robot missed in a row, and until when it gets no other, link clock.

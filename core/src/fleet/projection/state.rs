@@ -2,7 +2,7 @@
 //!
 //! Every room of `fleet` reads it. Rows come in by `loading`; `index` keeps what is derived.
 
-use super::memory::{Agenda, Answers, AttachedTime, Lasting, Unexplained, Waiting};
+use super::memory::{Agenda, AttachedTime, Lasting, UnansweredOffers, Unexplained, Waiting};
 use super::queue::Queue;
 use super::refused::Refused;
 use super::rows::{
@@ -97,7 +97,7 @@ projection! {
         /// Robots that did not want their last errand, and until when they are left alone, link clock.
         unwilling: BTreeMap<RobotId, crate::time::LinkTime> = BTreeMap::new();
         /// Offers that robots did not answer.
-        answers: Answers = Answers::default();
+        unanswered_offers: UnansweredOffers = UnansweredOffers::default();
         /// What robots say of themselves that only a person ends.
         lasting: Lasting = Lasting::new();
         /// What stands without a reason.

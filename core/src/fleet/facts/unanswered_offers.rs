@@ -22,11 +22,11 @@ use crate::time::{LinkDuration, Now};
 /// Notes that a robot heard an offer and did not answer it.
 pub fn note_missed_offer(tx: &mut Tx, robot_id: &RobotId) {
     let now = tx.now;
-    let answers = &mut tx.view.answers;
-    answers.missed.insert(robot_id.clone(), now.link);
-    answers.missed.retain(|_, at| now.link.since(*at) <= limits::UNANSWERED_AT_ONCE);
-    let at_once: Vec<RobotId> = answers.missed.keys().cloned().collect();
-    let in_row = answers.backed_off.get(robot_id).map_or(1, |(n, _)| n.saturating_add(1));
+    let unanswered = &mut tx.view.unanswered_offers;
+    unanswered.missed.insert(robot_id.clone(), now.link);
+    unanswered.missed.retain(|_, at| now.link.since(*at) <= limits::UNANSWERED_AT_ONCE);
+    let at_once: Vec<RobotId> = unanswered.missed.keys().cloned().collect();
+    let in_row = unanswered.backed_off.get(robot_id).map_or(1, |(n, _)| n.saturating_add(1));
     if are_many(at_once.len(), tx.view.sessions.len()) {
         at_once.iter().for_each(|robot_id| excuse_missed_offer(tx, robot_id));
         let reason = Reason::from(Code::OffersNotAnswered).with("robots", at_once.len());
@@ -44,7 +44,7 @@ pub fn note_refused_offer(tx: &mut Tx, robot_id: &RobotId, report: &AttemptRepor
     if code == Some(Code::UnsupportedAction) {
         return note_answer(tx, robot_id);
     }
-    let in_row = tx.view.answers.backed_off.get(robot_id).map_or(1, |(n, _)| n.saturating_add(1));
+    let in_row = tx.view.unanswered_offers.backed_off.get(robot_id).map_or(1, |(n, _)| n.saturating_add(1));
     back_off(tx, robot_id, in_row);
     if in_row >= limits::REFUSALS_IN_ROW {
         let why = code.map_or_else(|| "none given".to_owned(), |code| code.to_string());
@@ -67,7 +67,7 @@ fn are_many(missed: usize, robots: usize) -> bool {
 fn back_off(tx: &mut Tx, robot_id: &RobotId, in_row: u32) {
     let pause_ms = limits::UNANSWERED_PAUSE.as_ms() << in_row.saturating_sub(1).min(16);
     let until = tx.now.link + LinkDuration(pause_ms.min(limits::UNANSWERED_PAUSE_MAX.as_ms()));
-    tx.view.answers.backed_off.insert(robot_id.clone(), (in_row, until));
+    tx.view.unanswered_offers.backed_off.insert(robot_id.clone(), (in_row, until));
 }
 
 fn control(tx: &Tx, robot_id: &RobotId) -> RobotControl {
@@ -102,8 +102,8 @@ fn excuse_missed_offer(tx: &mut Tx, robot_id: &RobotId) {
 
 /// Notes that a robot took an offer, or refused it for what the task asks for.
 pub fn note_answer(tx: &mut Tx, robot_id: &RobotId) {
-    tx.view.answers.missed.remove(robot_id);
-    tx.view.answers.backed_off.remove(robot_id);
+    tx.view.unanswered_offers.missed.remove(robot_id);
+    tx.view.unanswered_offers.backed_off.remove(robot_id);
     let control = control(tx, robot_id);
     if control.unanswered_since.is_some() {
         tx.put_row(RobotControl { unanswered_since: None, unanswered: Vec::new(), ..control }, "robot.answered");
@@ -121,7 +121,7 @@ pub fn check_answering(view: &FleetProjection, robot_id: &RobotId, now: &Now) ->
         let left_ms = limits::BREAKER_WINDOW.as_ms() - now.ms_since(since);
         return Err(Reason::from(Code::RobotDoesNotAnswer).with("probe_in_ms", left_ms));
     }
-    match view.answers.backed_off.get(robot_id) {
+    match view.unanswered_offers.backed_off.get(robot_id) {
         Some((in_row, until)) if now.link < *until => {
             let left_ms = until.since(now.link).as_ms();
             Err(Reason::from(Code::OfferNotAnswered).with("in_a_row", in_row).with("again_in_ms", left_ms))
