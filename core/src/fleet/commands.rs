@@ -284,7 +284,7 @@ pub fn apply(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
             let labels = relabeled(control.labels.clone(), labels, removed);
             tx.put_row(RobotControl { labels, ..control }, "robot.labeled");
         }
-        Command::Drain { robot_id, reason, within_ms } => drain::ask(tx, robot_id, reason, actor, *within_ms),
+        Command::Drain { robot_id, reason, within_ms } => drain::request_drain(tx, robot_id, reason, actor, *within_ms),
         Command::Undrain { robot_id } => drain::undrain(tx, robot_id),
         Command::PutPolicy(policy) => {
             tx.put_row(policy.clone(), "area.policy_put");

@@ -77,7 +77,7 @@ impl FleetService {
         request_id: Option<String>,
     ) -> Result<Option<v1::RobotControl>, Refusal> {
         self.act(command, by, revision_of(etag), validate_only, request_id).await?;
-        self.ask(move |view, board, _| Some(encode::control(view, board, &robot_id))).await
+        self.query_projection(move |view, board, _| Some(encode::control(view, board, &robot_id))).await
     }
 
     async fn cordon(&self, r: v1::CordonRobotRequest, by: &Caller) -> Result<v1::CordonRobotResponse, Refusal> {
@@ -164,7 +164,7 @@ impl FleetService {
         let robot_id = RobotId::parse(&r.robot_id).map_err(|e| Refusal::field("robot_id", e.to_string()))?;
         let by = by.clone();
         let found = self
-            .ask(move |view, board, _| {
+            .query_projection(move |view, board, _| {
                 let is_there = view.sessions.contains_key(robot_id.as_str());
                 let is_seen = is_there && sees_robot(view, board, &by, &robot_id);
                 is_seen.then(|| encode::control(view, board, &robot_id))
@@ -183,7 +183,7 @@ impl FleetService {
         let size = pages::size(r.page_size, &mut bad);
         bad.finish()?;
         let by = by.clone();
-        self.ask(move |view: &FleetProjection, board, now| {
+        self.query_projection(move |view: &FleetProjection, board, now| {
             let robots = view.sessions.values().map(|session| &session.row.robot_id);
             let robots = robots.filter(|robot_id| sees_robot(view, board, &by, robot_id));
             let (robots, next_page_token) = pages::page(robots.map(|id| (id.to_string(), id)), &r.page_token, size);
@@ -199,7 +199,7 @@ impl FleetService {
             return Err(not_found(Code::AreaNotFound, area_id));
         }
         let found = self
-            .ask(move |view, _, _| {
+            .query_projection(move |view, _, _| {
                 view.site.find_area(&id)?;
                 let revision = view.policies.get(id.as_str()).map(|p| p.revision);
                 Some(encode_policy(&view.policy(&id), revision))
@@ -219,7 +219,7 @@ impl FleetService {
         let policy = policy.ok_or_else(|| Refusal::field("policy", "is required"))?;
         let area_id = policy.area_id.clone();
         self.act(Command::PutPolicy(policy), by, seen, r.validate_only, request_id).await?;
-        let robots = self.ask(|view, _, _| view.sessions.len() as u32).await?;
+        let robots = self.query_projection(|view, _, _| view.sessions.len() as u32).await?;
         Ok(v1::PutAreaPolicyResponse { policy: Some(self.policy(area_id, by).await?), robots })
     }
 
@@ -229,7 +229,7 @@ impl FleetService {
         bad.finish()?;
         let by = by.clone();
         let (places, next_page_token) = self
-            .ask(move |view: &FleetProjection, _, _| {
+            .query_projection(move |view: &FleetProjection, _, _| {
                 let in_use = |p: &midshift_core::fleet::rows::Place| {
                     !p.holders.is_empty()
                         || p.quarantine.is_some()
@@ -261,7 +261,9 @@ impl FleetService {
         let command = Command::ClearPlace { place_id: place_id.clone(), reason: r.reason };
         self.act(command, by, seen, r.validate_only, request_id).await?;
         let place = self
-            .ask(move |view, _, _| view.places.get(place_id.as_str()).map(|p| encode::place(view, &p.row, p.revision)))
+            .query_projection(move |view, _, _| {
+                view.places.get(place_id.as_str()).map(|p| encode::place(view, &p.row, p.revision))
+            })
             .await?;
         Ok(v1::ClearPlaceResponse { place })
     }
@@ -270,7 +272,7 @@ impl FleetService {
         let task_id = TaskId::parse(&r.task_id).map_err(|e| Refusal::field("task_id", e.to_string()))?;
         let (asked, reader) = (task_id.clone(), by.clone());
         let (found, now) = self
-            .ask(move |view, board, now| {
+            .query_projection(move |view, board, now| {
                 let found = explain::task(view, board, now, &asked).filter(|_| sees_task(view, &reader, &asked));
                 let found = found.map(|mut found| {
                     found.candidates.retain(|c| sees_robot(view, board, &reader, &c.robot_id));
@@ -316,7 +318,7 @@ impl FleetService {
         let robot_id = RobotId::parse(&r.robot_id).map_err(|e| Refusal::field("robot_id", e.to_string()))?;
         let by = by.clone();
         let found = self
-            .ask(move |view, board, now| {
+            .query_projection(move |view, board, now| {
                 let found = explain::robot(view, board, now, &robot_id);
                 let mut found = found.filter(|_| sees_robot(view, board, &by, &robot_id))?;
                 found.candidates.retain(|c| sees_task(view, &by, &c.task_id));
@@ -334,7 +336,7 @@ impl FleetService {
         bad.finish()?;
         let by = by.clone();
         let (incidents, next_page_token) = self
-            .ask(move |view: &FleetProjection, board, _| {
+            .query_projection(move |view: &FleetProjection, board, _| {
                 let wanted = |i: &Incident| {
                     (r.include_closed || i.closed.is_none()) && (robot_id.is_none() || i.robot_id == robot_id)
                 };
@@ -351,7 +353,7 @@ impl FleetService {
     async fn incident(&self, incident_id: String, by: &Caller) -> Result<v1::Incident, Refusal> {
         let (id, by) = (incident_id.clone(), by.clone());
         let found = self
-            .ask(move |view, board, _| {
+            .query_projection(move |view, board, _| {
                 let found = view.incidents.get(&id).filter(|i| sees_incident(view, board, &by, &i.row));
                 found.map(|i| encode::incident(&i.row, i.revision))
             })
@@ -375,7 +377,7 @@ impl FleetService {
         bad.finish()?;
         let by = by.clone();
         let (counters, next_page_token) = self
-            .ask(move |view, board, _| {
+            .query_projection(move |view, board, _| {
                 let wanted = |c: &midshift_core::fleet::rows::RobotCounter| {
                     (r.robot_ids.is_empty() || r.robot_ids.iter().any(|id| id == c.robot_id.as_str()))
                         && (r.software.is_empty() || r.software == c.software)

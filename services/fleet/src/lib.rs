@@ -68,7 +68,7 @@ impl FleetService {
     /// # Errors
     /// If the reconciler does not run.
     pub async fn place_waits(&self) -> Result<u64, Refusal> {
-        self.ask(|view, _, _| view.place_waits).await
+        self.query_projection(|view, _, _| view.place_waits).await
     }
 
     async fn send(&self, request: Request) -> Result<(), Refusal> {
@@ -78,7 +78,7 @@ impl FleetService {
         })
     }
     /// Runs `look` on the projection and gives its answer.
-    pub async fn ask<T: Send + 'static>(
+    pub async fn query_projection<T: Send + 'static>(
         &self,
         look: impl FnOnce(&FleetProjection, &Board, &Now) -> T + Send + 'static,
     ) -> Result<T, Refusal> {

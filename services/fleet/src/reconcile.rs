@@ -311,7 +311,7 @@ impl Loop {
         let mut plan = Plan::for_slice(Slice::for_decisions(share));
         self.take_feed(now, &mut plan).await.map_err(|error| tracing::warn!(%error, "fleet cannot read the feed"))?;
         let unread = |error| tracing::warn!(%error, "fleet cannot read what is over");
-        self.ask(used_ids(&requests)).await.map_err(unread)?;
+        self.load_wanted_rows(used_ids(&requests)).await.map_err(unread)?;
         let renewal = match self.lease.next_action(now.link) {
             LeaseAction::StepDown => {
                 // What was planned a moment ago is dropped, and with it the projection that holds it.
@@ -411,7 +411,7 @@ impl Loop {
     }
 
     /// Reads by id what the projection wants to know of what is over, and these rows too.
-    pub(crate) async fn ask(&mut self, mut keys: Vec<Key>) -> Result<(), Error> {
+    pub(crate) async fn load_wanted_rows(&mut self, mut keys: Vec<Key>) -> Result<(), Error> {
         keys.extend(self.view.wanted());
         if keys.is_empty() {
             return Ok(());

@@ -34,7 +34,7 @@ impl Loop {
             }
         };
         follow(self.parts.store.as_ref(), &mut self.seq, LOGS, take).await?;
-        self.ask(Vec::new()).await?;
+        self.load_wanted_rows(Vec::new()).await?;
         for text in unreadable {
             tracing::error!(text, "fleet passed over something it cannot read");
         }
@@ -70,7 +70,7 @@ impl Loop {
     async fn carry_out(&mut self, asked: &PendingCommand) -> Result<Result<(), Refusal>, Error> {
         let used: Vec<Key> = asked.request_id.iter().map(|id| Key::new(Table::CommandKey, id)).collect();
         for _ in 0..limits::COMMAND_TRIES {
-            self.ask(used.clone()).await?;
+            self.load_wanted_rows(used.clone()).await?;
             let item = match self.decide(asked) {
                 Ok(Some(item)) => item,
                 Ok(None) => return Ok(Ok(())),

@@ -117,7 +117,7 @@ impl TaskService {
             return fits.map(|()| v1::CancelTaskResponse { task: Some(task.encode()), pending: false });
         }
         self.noted(&asked, fits).await?;
-        let pending = self.ask(earlier, asked).await?;
+        let pending = self.submit_command(earlier, asked).await?;
         let task = read(self.store(), &task_id).await?;
         Ok(v1::CancelTaskResponse { task: Some(task.encode()), pending })
     }
@@ -166,7 +166,7 @@ impl TaskService {
             return fits.map(|()| v1::ResolveTaskResponse { task: Some(task.encode()), pending: false });
         }
         self.noted(&asked, fits).await?;
-        let pending = self.ask(earlier, asked).await?;
+        let pending = self.submit_command(earlier, asked).await?;
         let task = read(self.store(), &task_id).await?;
         Ok(v1::ResolveTaskResponse { task: Some(task.encode()), pending })
     }
@@ -211,7 +211,7 @@ impl TaskService {
     }
 
     /// Makes a request durable unless it is a repeat, and waits a little for fleet. True: fleet has not looked at it yet.
-    pub(crate) async fn ask(&self, earlier: Option<Seq>, asked: PendingCommand) -> Result<bool, Refusal> {
+    pub(crate) async fn submit_command(&self, earlier: Option<Seq>, asked: PendingCommand) -> Result<bool, Refusal> {
         let place = match earlier {
             Some(place) => place,
             None => self.write(asked).await?,

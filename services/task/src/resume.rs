@@ -110,7 +110,7 @@ impl TaskService {
                 held => Some(held?),
             },
         };
-        let pending = if r.validate_only { false } else { self.ask(earlier, asked).await? };
+        let pending = if r.validate_only { false } else { self.submit_command(earlier, asked).await? };
         let robots = held.as_ref().map(|held| held.waiting.len() as u32);
         let stopped = held.map(|held| held.stopped).unwrap_or_default();
         let still_stopped = stopped.iter().take(limits::PAGE_MAX).map(ToString::to_string).collect();

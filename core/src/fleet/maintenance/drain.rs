@@ -29,7 +29,7 @@ const PLANNED_MM_S: u64 = 600;
 const PLANNED_ACTION_MS: u64 = 20_000;
 
 /// Asks for a drain on behalf of a person. Its id is never used again.
-pub fn ask(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str, within_ms: u64) {
+pub fn request_drain(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str, within_ms: u64) {
     let over = tx.view.all_drains_of(robot_id).filter(|d| d.is_of_person() && d.state == DrainState::Refused);
     let over: Vec<DrainId> = over.map(|d| d.drain_id.clone()).collect();
     over.iter().for_each(|id| tx.delete::<Drain>(id.as_str(), "drain.forgotten"));

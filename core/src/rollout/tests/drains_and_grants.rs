@@ -319,7 +319,7 @@ fn a_load_keeps_nobody_from_going_back_nor_from_a_person_who_asked_for_the_robot
     opened(&mut rig, 1, crate::task::Phase::Queued);
     rig.ticks(1);
     let mut plan = fleet::Plan::default();
-    plan.decide(&mut rig.fleet, rig.now, "ana", |tx| drain::ask(tx, &robot_id(0), "oil", "ana", 60_000));
+    plan.decide(&mut rig.fleet, rig.now, "ana", |tx| drain::request_drain(tx, &robot_id(0), "oil", "ana", 60_000));
     rig.commit(plan.items);
     rig.put_row(crate::maintenance::DrainRequest { is_way_back: true, ..request(1, false) });
     rig.ticks(3);
@@ -391,7 +391,7 @@ fn a_drain_behind_one_of_a_person_is_given_up_after_an_hour() {
     rig.start(spec());
     let n = rig.order()[0];
     let mut plan = fleet::Plan::default();
-    plan.decide(&mut rig.fleet, rig.now, "ana", |tx| drain::ask(tx, &robot_id(n), "oil", "ana", 60_000));
+    plan.decide(&mut rig.fleet, rig.now, "ana", |tx| drain::request_drain(tx, &robot_id(n), "oil", "ana", 60_000));
     rig.commit(plan.items);
     rig.ticks(10);
     assert_eq!(rig.step(n), Step::Draining);

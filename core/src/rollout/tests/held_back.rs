@@ -153,7 +153,7 @@ fn a_frozen_area_keeps_no_person_from_taking_a_robot_out_of_work() {
     let mut rig = Rig::new(2);
     rig.rules(|s| s.frozen = true);
     let mut plan = fleet::Plan::default();
-    plan.decide(&mut rig.fleet, rig.now, "ana", |tx| drain::ask(tx, &robot_id(0), "oil", "ana", 60_000));
+    plan.decide(&mut rig.fleet, rig.now, "ana", |tx| drain::request_drain(tx, &robot_id(0), "oil", "ana", 60_000));
     rig.commit(plan.items);
     rig.ticks(3);
     assert!(rig.fleet.drains.values().all(|d| d.row.state == DrainState::Held) && rig.fleet.drains.len() == 1);

@@ -66,7 +66,7 @@ async fn only_those_ended_tasks_are_known_that_a_task_waits_for() {
     w.until_phase("T1", Phase::Running).await;
     let known = |of: &FleetService| {
         let of = of.clone();
-        async move { of.ask(|view, _, _| view.ended.clone()).await.expect("the reconciler runs") }
+        async move { of.query_projection(|view, _, _| view.ended.clone()).await.expect("the reconciler runs") }
     };
     let id = |id: &str| TaskId::parse(id).expect("an id");
     let both = [(id("old-1"), Phase::Succeeded), (id("old-3"), Phase::Failed)];
@@ -84,7 +84,7 @@ async fn only_those_ended_tasks_are_known_that_a_task_waits_for() {
     assert_eq!(known(&w.fleet).await, [(id("old-3"), Phase::Failed)].into(), "nobody waits for the others any more");
     let verdict = w
         .fleet
-        .ask(move |view, board, now| {
+        .query_projection(move |view, board, now| {
             midshift_core::fleet::explain::task(view, board, now, &id("T2")).and_then(|e| e.verdict)
         })
         .await

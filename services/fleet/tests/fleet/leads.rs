@@ -186,8 +186,8 @@ async fn a_standby_answers_what_the_leader_answers() {
         let ready: Vec<_> = view.queue.ready().collect();
         format!("{:?} {:?} {:?} {:?} {ready:?}", view.tasks, view.attempts, view.places, view.authority)
     };
-    let led = w.fleet.ask(move |view, _, _| slots(view)).await.expect("it runs");
-    let stood_by = other.ask(move |view, _, _| slots(view)).await.expect("it runs");
+    let led = w.fleet.query_projection(move |view, _, _| slots(view)).await.expect("it runs");
+    let stood_by = other.query_projection(move |view, _, _| slots(view)).await.expect("it runs");
     assert_eq!(led, stood_by);
 }
 

@@ -37,7 +37,7 @@ fn without_empty(mut slots: BTreeMap<&'static str, Vec<String>>) -> BTreeMap<&'s
 async fn projections_agree(w: &mut World) {
     let mut last = None;
     for _ in 0..8 {
-        let kept = w.fleet.ask(|view, _, _| slots(view)).await.expect("the reconciler runs");
+        let kept = w.fleet.query_projection(|view, _, _| slots(view)).await.expect("the reconciler runs");
         let snapshot = w.store.read(&alive(), named).await.expect("a snapshot");
         let now = w.clock.now();
         let mut view = FleetProjection::new(w.site.clone(), now, now);

@@ -29,7 +29,7 @@ async fn a_flood_of_questions_delays_no_sweep_by_more_than_the_questions_of_one_
         let (fleet, answered) = (w.fleet.clone(), answered.clone());
         people.spawn(async move {
             loop {
-                fleet.ask(|view, _, _| view.tasks.len()).await.expect("an answer");
+                fleet.query_projection(|view, _, _| view.tasks.len()).await.expect("an answer");
                 answered.fetch_add(1, Ordering::Relaxed);
             }
         });
@@ -37,7 +37,8 @@ async fn a_flood_of_questions_delays_no_sweep_by_more_than_the_questions_of_one_
     let most = TURNS * limits::REQUESTS_PER_TURN as u64;
     for _ in 0..8 {
         // Nothing but a sweep compares a heartbeat with the rows.
-        let compared = async |w: &World| w.fleet.ask(|view, _, _| view.compared.clone()).await.expect("an answer");
+        let compared =
+            async |w: &World| w.fleet.query_projection(|view, _, _| view.compared.clone()).await.expect("an answer");
         let known = compared(&w).await;
         w.beat("r1");
         let before = answered.load(Ordering::Relaxed);
@@ -68,7 +69,7 @@ async fn a_long_plan_lets_a_question_in_after_each_slice() {
         |view: &FleetProjection| view.tasks.values().filter(|task| task.row.phase == Phase::NeedsOperator).count();
     let (mut last, mut answers) = (0, 0);
     while last < tasks {
-        let now = w.fleet.ask(move |view, _, _| asked(view)).await.expect("an answer");
+        let now = w.fleet.query_projection(move |view, _, _| asked(view)).await.expect("an answer");
         assert!(now <= last + limits::DECISIONS_PER_STAGE, "{} decisions in one go", now - last);
         answers += usize::from(now > last && last > 0);
         last = now;

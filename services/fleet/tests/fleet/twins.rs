@@ -210,7 +210,7 @@ async fn comes_first_at_last(bugs: &[SeededBug]) -> bool {
     for n in 0..12 {
         w.submit_with(&format!("new-{n}"), "A", "B", |raw| raw.priority = Some(2)).await;
         w.pass(600).await;
-        let first = w.fleet.ask(|view, _, _| view.queue.ready().next().cloned()).await;
+        let first = w.fleet.query_projection(|view, _, _| view.queue.ready().next().cloned()).await;
         let first = first.expect("an answer").expect("a task that is ready");
         if first.as_str() == "old" {
             return true;
