@@ -309,7 +309,7 @@ fn sign(what: &What, repository: &Path, keys: &[PathBuf], out: &Out) -> Result<(
     let signed = match what {
         What::New(bundle, from) => match key_set(bundle)? {
             Some(set) => folder.add_keys(&set, &keys, clock::wall())?.1,
-            None => folder.add_with_ways(bundle, from, &keys, clock::wall())?.1,
+            None => folder.add_with_encoded_targets(bundle, from, &keys, clock::wall())?.1,
         },
         What::Pending(handed) => folder.cosign(&keys, handed)?,
         What::Again => folder.renew(&keys, clock::wall())?,

@@ -3,13 +3,14 @@
 //! Invariant: a targets document gets its number only once enough people have signed it; until then it is `pending.targets.json` and
 //! nobody believes it. Files are in place before the document that names them. A key that is not asked for signs nothing here.
 
+mod encoded_targets;
 mod roots;
-mod ways;
 
 pub use crate::roots::WaitingRoot;
 
 use crate::build::{self, inspect};
 use crate::digest::Digest;
+use crate::encoded_target::targets_of_gone;
 use crate::key_set::KeySet;
 use crate::keys::{self, SecretKey};
 use crate::manifest::{Component, Manifest};
@@ -18,7 +19,6 @@ use crate::repository::{
     sign_root, sign_targets, version_of,
 };
 use crate::roots::{RequiredSigners, merge_targets};
-use crate::ways::ways_to;
 use midshift_core::reason::{Refusal, Violations};
 use midshift_core::time::Utc;
 use std::collections::BTreeSet;
@@ -234,14 +234,16 @@ impl Folder {
     ///
     /// # Errors
     /// As there; a release that is not listed; files of releases before that are not in this folder.
-    pub fn add_with_ways(
+    pub fn add_with_encoded_targets(
         &self,
         bundle: &Path,
         from: &[String],
         keys: &[&SecretKey],
         now: Utc,
     ) -> Result<(Manifest, Signed), Error> {
-        self.add_and(bundle, keys, now, |manifest, previous| self.make_ways(bundle, manifest, previous, from))
+        self.add_and(bundle, keys, now, |manifest, previous| {
+            self.make_encoded_targets(bundle, manifest, previous, from)
+        })
     }
 
     fn add_and(
@@ -298,7 +300,7 @@ impl Folder {
         let lost = withdrawn.components.iter().map(|c| c.digest).filter(|digest| !kept.contains(digest)).collect();
         let previous = self.newest("targets")?.map(|(_, document)| document);
         let known = previous.as_deref().map(listed).transpose()?.unwrap_or_default();
-        gone.extend(ways_to(&lost, &known).map(str::to_owned));
+        gone.extend(targets_of_gone(&lost, &known).map(str::to_owned));
         let signed = sign_targets(previous.as_deref(), &[], &gone, now.plus_ms(PEOPLE_LIFE_MS), keys)?;
         Ok((withdrawn, self.store_signed(&signed)?))
     }

@@ -107,7 +107,7 @@ struct Played {
 
 /// How a round of them is played.
 #[derive(Default)]
-pub struct Way<'w> {
+pub struct RoundOptions<'w> {
     /// Beginnings of the names of those that are played; none: all are.
     pub only: Option<Vec<&'w str>>,
     /// A variable of their environment.
@@ -160,17 +160,17 @@ impl Permits {
 }
 
 /// Plays them; whether all passed. Tests are added to `count`.
-pub fn play(round: &Round<'_>, way: &Way<'_>, count: &mut Count) -> Result<bool> {
+pub fn play(round: &Round<'_>, options: &RoundOptions<'_>, count: &mut Count) -> Result<bool> {
     let program = program(round.workspace)?;
     let times = Times::read(round.workspace);
-    let tests: Vec<String> = tests(round.workspace, &program)?.into_iter().filter(|name| way.plays(name)).collect();
+    let tests: Vec<String> = tests(round.workspace, &program)?.into_iter().filter(|name| options.plays(name)).collect();
     ensure!(!tests.is_empty(), "no end-to-end test has such a name");
     let folder = round.workspace.target.join("e2e");
     std::fs::create_dir_all(&folder).with_context(|| format!("creating {}", folder.display()))?;
     let queue = Unit::in_order(&tests, &times.0, threads());
     let stop = AtomicBool::new(false);
     let played = std::thread::scope(|scope| {
-        for _ in 0..if way.is_loaded { threads() / 2 } else { 0 } {
+        for _ in 0..if options.is_loaded { threads() / 2 } else { 0 } {
             scope.spawn(|| {
                 while !stop.load(Ordering::Relaxed) {
                     std::hint::spin_loop();
@@ -182,12 +182,12 @@ pub fn play(round: &Round<'_>, way: &Way<'_>, count: &mut Count) -> Result<bool>
             queue,
             permits,
             || cores.are_idle(),
-            |unit, slot| round.one(unit, way, &program, &folder, ports(slot, permits.idle)),
+            |unit, slot| round.one(unit, options, &program, &folder, ports(slot, permits.idle)),
         );
         stop.store(true, Ordering::Relaxed);
         played
     });
-    if way.variable.is_none() && !way.is_loaded {
+    if options.variable.is_none() && !options.is_loaded {
         times.with(&played).write(round.workspace)?;
     }
     summary(&played, count)
@@ -263,7 +263,7 @@ impl Played {
     }
 }
 
-impl Way<'_> {
+impl RoundOptions<'_> {
     fn plays(&self, name: &str) -> bool {
         self.only.as_ref().is_none_or(|only| only.iter().any(|begin| name.starts_with(begin)))
     }
@@ -274,7 +274,7 @@ impl Round<'_> {
     fn one(
         &self,
         unit: &Unit,
-        way: &Way<'_>,
+        options: &RoundOptions<'_>,
         program: &Path,
         folder: &Path,
         ports: Range<usize>,
@@ -286,7 +286,7 @@ impl Round<'_> {
         } else {
             command.arg("--exact");
         }
-        command.envs(way.variable).env(PORTS_VARIABLE, format!("{}..{}", ports.start, ports.end));
+        command.envs(options.variable).env(PORTS_VARIABLE, format!("{}..{}", ports.start, ports.end));
         self.surround(&mut command)?;
         let log = format!("{}.log", unit.name.trim_end_matches(':').replace("::", "."));
         ended(&mut command, &folder.join(log))

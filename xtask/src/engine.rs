@@ -4,7 +4,7 @@
 //! takeover, a wake, a kill. A name here that no test has any more fails, and so does one that finds PostgreSQL by itself and would run
 //! twice there. Every night all tests run so.
 
-use crate::e2e::Way;
+use crate::e2e::RoundOptions;
 use crate::round::Scope;
 use crate::run;
 
@@ -22,14 +22,14 @@ const AGAIN: &[(&str, &str)] = &[
 ];
 
 /// The tests that run again, and how.
-pub fn way(scope: Scope) -> Way<'static> {
+pub fn round_options(scope: Scope) -> RoundOptions<'static> {
     let listed = || {
         for (name, why) in AGAIN {
             run::tell_person(&format!("again on PostgreSQL: {name}*: {why}"));
         }
         AGAIN.iter().map(|(name, _)| *name).collect()
     };
-    Way { only: (scope == Scope::Daily).then(listed), variable: Some(VARIABLE), is_loaded: false }
+    RoundOptions { only: (scope == Scope::Daily).then(listed), variable: Some(VARIABLE), is_loaded: false }
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 //! Invariant: the folder of a version is written once. What a release left is a fact, and a test that fails on it is not
 //! mended by writing it anew.
 
-use crate::e2e::{self, Way};
+use crate::e2e::{self, RoundOptions};
 use crate::fetch_tools::Tools;
 use crate::round::{Count, Round, Scope};
 use crate::workspace::Workspace;
@@ -39,7 +39,7 @@ fn record(workspace: &Workspace, version: &str) -> Result<bool> {
     let (round, mut count) =
         (Round { workspace, tools: Some(tools), scope: Scope::Daily, only: &[] }, Count::default());
     let only = Some(vec!["released::recorded::a_run_on_"]);
-    let run = e2e::play(&round, &Way { only, variable: Some(variable), is_loaded: false }, &mut count)?;
+    let run = e2e::play(&round, &RoundOptions { only, variable: Some(variable), is_loaded: false }, &mut count)?;
     ensure!(run, "the run failed");
     let shift = ["--test", "simulation", "--", "frames::a_shift_says_"];
     ensure!(round.tests_with(&shift, Some(variable), &mut count)?, "the shift failed");

@@ -133,11 +133,13 @@ impl Part {
             }
             Self::E2e => {
                 let only = (!round.only.is_empty()).then(|| round.only.iter().map(String::as_str).collect());
-                e2e::play(round, &e2e::Way { only, ..e2e::Way::default() }, count)
+                e2e::play(round, &e2e::RoundOptions { only, ..e2e::RoundOptions::default() }, count)
             }
-            Self::Engine => e2e::play(round, &engine::way(round.scope), count),
+            Self::Engine => e2e::play(round, &engine::round_options(round.scope), count),
             Self::Quick => quick::run(round, count),
-            Self::Loaded => e2e::play(round, &e2e::Way { is_loaded: true, ..e2e::Way::default() }, count),
+            Self::Loaded => {
+                e2e::play(round, &e2e::RoundOptions { is_loaded: true, ..e2e::RoundOptions::default() }, count)
+            }
             Self::Doc => round.tests(&["--doc"], count),
             Self::Dist => count.one(dist::test(workspace)),
             Self::Stack => count.one(stack::test(workspace, &Which::split(), Some(workspace.midshift()))),

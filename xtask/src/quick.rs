@@ -2,7 +2,7 @@
 //!
 //! Invariant: it proves nothing that the suite does not prove again.
 
-use crate::e2e::{self, Way};
+use crate::e2e::{self, RoundOptions};
 use crate::round::{Count, Round};
 use anyhow::Result;
 
@@ -22,7 +22,7 @@ pub fn run(round: &Round<'_>, count: &mut Count) -> Result<bool> {
     let pages = round.tests(&["--test", "architecture", "--test", "model"], count)?;
     let simulation = ["--test", "simulation", "--", "many_seeds_keep_every_law"];
     let shifts = round.tests_with(&simulation, Some(SEEDS), count)?;
-    let programs = e2e::play(round, &Way { only: Some(HANDFUL.to_vec()), ..Way::default() }, count)?;
+    let programs = e2e::play(round, &RoundOptions { only: Some(HANDFUL.to_vec()), ..RoundOptions::default() }, count)?;
     Ok(pages && shifts && programs)
 }
 

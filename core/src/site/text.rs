@@ -69,7 +69,7 @@ fn junction() -> Kind {
 
 #[derive(Deserialize, Default, Clone, Copy, PartialEq)]
 #[serde(rename_all = "snake_case")]
-enum Ways {
+enum LaneTraffic {
     #[default]
     One,
     Two,
@@ -81,7 +81,7 @@ enum Ways {
 struct RawLane {
     path: Vec<String>,
     #[serde(default)]
-    ways: Ways,
+    ways: LaneTraffic,
     length_mm: Option<u32>,
     speed_limit_mm_s: Option<u32>,
 }
@@ -207,11 +207,11 @@ fn expand_lane(v: &mut Violations, field: String, raw: &RawLane, lanes: &mut Vec
                 to: to.clone(),
                 length_mm: raw.length_mm,
                 speed_limit_mm_s: raw.speed_limit_mm_s,
-                wide: raw.ways == Ways::Wide,
+                wide: raw.ways == LaneTraffic::Wide,
             });
         };
         push(&pair[0], &pair[1]);
-        if raw.ways != Ways::One {
+        if raw.ways != LaneTraffic::One {
             push(&pair[1], &pair[0]);
         }
     }

@@ -382,7 +382,7 @@ mod tests {
     type Facts = [(bool, bool, bool); 2];
 
     #[derive(Clone)]
-    struct Way {
+    struct Walk {
         robot: RobotStop,
         facts: Facts,
         around: Around,
@@ -391,7 +391,7 @@ mod tests {
         stage: Stage,
     }
 
-    impl Way {
+    impl Walk {
         fn after(&self, happens: Happens) -> Self {
             let mut next = self.clone();
             let mut wall = Utc(3);
@@ -465,7 +465,7 @@ mod tests {
         let all = [1, 2].into_iter().flat_map(|n| [Happens::Engaged(n), Happens::Reset(n), Happens::Resumed(n)]);
         let others = [Happens::ToldAll, Happens::Answered, Happens::Began, Happens::Silence, Happens::Walked];
         let all: Vec<Happens> = all.chain(others).chain([Happens::Forgot, Happens::SilencesResumed]).collect();
-        let first = Way {
+        let first = Walk {
             robot: RobotStop::begin(robot(), SavedStops::default(), LinkTime(0)),
             facts: Facts::default(),
             around: Around::Robots,

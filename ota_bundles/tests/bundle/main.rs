@@ -3,6 +3,7 @@
 mod building;
 mod by_hand;
 mod directives;
+mod encoded_targets;
 mod fresh;
 mod kept;
 mod key_sets;
@@ -14,5 +15,4 @@ mod says;
 mod sets;
 mod shelf;
 mod twins;
-mod ways;
 mod workflow;

@@ -260,7 +260,7 @@ impl Software {
 
 /// What one run of a machine has of its own: a simulated robot's network, which can be cut, and the pulse.
 #[derive(Default)]
-pub struct Ways {
+pub struct RunOptions {
     /// While it says false nothing passes to the server; none: nobody cuts it.
     pub network: Option<watch::Receiver<bool>>,
     /// The same to the stop service.
@@ -317,9 +317,14 @@ impl Machine {
     ///
     /// # Errors
     /// An address that is none; a ledger that cannot be kept; another machine with this robot's name.
-    pub async fn run(self, body: Box<dyn Body>, ways: Ways, shutdown: CancellationToken) -> Result<ExitReason, Error> {
+    pub async fn run(
+        self,
+        body: Box<dyn Body>,
+        options: RunOptions,
+        shutdown: CancellationToken,
+    ) -> Result<ExitReason, Error> {
         let Self { config, robot_id, clock, store, new_ring_id, identity, software } = self;
-        let Ways { network, stop_network, pulse } = ways;
+        let RunOptions { network, stop_network, pulse } = options;
         let tls = identity.as_ref().map(Identity::tls);
         let scheme = if tls.is_some() { "https" } else { "http" };
         let dial = |address: &str, network: Option<watch::Receiver<bool>>| -> Result<TcpDial, dial::Error> {
@@ -395,7 +400,7 @@ pub fn run(config: Config, body: Box<dyn Body>) -> Pin<Box<dyn Future<Output = E
 async fn until_told(config: Config, body: Box<dyn Body>) -> Result<ExitReason, Error> {
     let machine = Machine::open(config, clock::real(|_| ())).await?;
     let (shutdown, ways) =
-        (CancellationToken::new(), Ways { pulse: launcher_heartbeat::for_launcher(), ..Ways::default() });
+        (CancellationToken::new(), RunOptions { pulse: launcher_heartbeat::for_launcher(), ..RunOptions::default() });
     let mut driven = Box::pin(machine.run(body, ways, shutdown.clone()));
     tokio::select! {
         ended = &mut driven => return ended,

@@ -102,7 +102,7 @@ type Replaying = (u64, Replayed);
 type Worked = (Box<dyn Worker>, Done);
 
 /// On the way to a session.
-enum Way {
+enum ConnectState {
     /// Nothing under way.
     Idle,
     /// Not yet.
@@ -135,7 +135,7 @@ pub struct Agent {
     lines: Lines,
     stop: Option<Line>,
     open: Option<Open>,
-    way: Way,
+    connect_state: ConnectState,
     retry: ExponentialBackoff,
     /// How long the next session may be silent if it is only observed.
     patience: LinkDuration,
@@ -196,7 +196,7 @@ pub fn run(
             lines,
             stop,
             open: None,
-            way: Way::Idle,
+            connect_state: ConnectState::Idle,
             store: Some(store),
             batch: 0,
             committing: None,
@@ -277,14 +277,14 @@ impl Agent {
     async fn wait(&mut self, shutdown: &CancellationToken) -> Woken {
         let now = self.clock.now();
         let due = tokio::time::sleep(self.until_due(&now));
-        let Self { committing, working, replaying, way, open, stop, .. } = self;
+        let Self { committing, working, replaying, connect_state, open, stop, .. } = self;
         tokio::select! {
             biased;
             event = stopping(stop) => Woken::Stop(event),
             (store, done) = ready(committing) => { *committing = None; Woken::Committed(store, done) }
             () = shutdown.cancelled() => Woken::Shutdown,
             (worker, done) = ready(working) => { *working = None; Woken::Worked(worker, Box::new(done)) }
-            woken = progress(way) => { *way = Way::Idle; woken }
+            woken = progress(connect_state) => { *connect_state = ConnectState::Idle; woken }
             message = next(open) => Woken::Down(message.map(Box::new)),
             (epoch, replayed) = ready(replaying) => { *replaying = None; Woken::Replayed(epoch, replayed) }
             () = due => Woken::Due,
@@ -392,7 +392,7 @@ impl Agent {
         tracing::info!(robot_id = %self.config.robot_id, why, "session lost");
         self.leave_session();
         self.step(Input::Disconnected);
-        if matches!(self.way, Way::Idle) {
+        if matches!(self.connect_state, ConnectState::Idle) {
             self.wait_to_dial(None);
         }
     }
@@ -411,7 +411,7 @@ impl Agent {
 
     fn wait_to_dial(&mut self, at_least: Option<Duration>) {
         let pause = at_least.or_else(|| self.retry.next()).unwrap_or(RETRY.end);
-        self.way = Way::Waiting(Box::pin(tokio::time::sleep(pause)));
+        self.connect_state = ConnectState::Waiting(Box::pin(tokio::time::sleep(pause)));
     }
 
     fn soon(&mut self) -> Duration {
@@ -420,7 +420,7 @@ impl Agent {
 
     fn dial_now(&mut self) {
         let dial = self.lines.link.clone();
-        self.way = Way::Dialing(Box::pin(async move { dial.dial().await.map_err(|e| e.causes()) }));
+        self.connect_state = ConnectState::Dialing(Box::pin(async move { dial.dial().await.map_err(|e| e.causes()) }));
     }
 
     fn greet(&mut self, channel: Channel) {
@@ -428,7 +428,7 @@ impl Agent {
         let hello = FromRobot::Hello(Box::new(self.hello(&now)));
         let greeting = greet(channel, v1::SessionRequest::from(&hello), self.clock.clone());
         let limit = Duration::from_millis(SILENCE.as_ms());
-        self.way = Way::Greeting(Box::pin(async move {
+        self.connect_state = ConnectState::Greeting(Box::pin(async move {
             tokio::time::timeout(limit, greeting).await.unwrap_or_else(|_| Greeted::Failed("no welcome".to_owned()))
         }));
     }
@@ -507,7 +507,7 @@ impl Agent {
             Ok(ToRobot::Downlink(down)) => self.step(Input::Down(down)),
             Ok(ToRobot::Close(close)) => self.closed(&close),
             Ok(ToRobot::MoveOver { .. }) => {
-                if matches!(self.way, Way::Idle) {
+                if matches!(self.connect_state, ConnectState::Idle) {
                     let pause = self.soon();
                     self.wait_to_dial(Some(pause));
                 }
@@ -522,7 +522,7 @@ impl Agent {
 
     fn closed(&mut self, close: &Close) {
         tracing::info!(robot_id = %self.config.robot_id, code = ?close.code, reason = close.reason.name(), "closed by server");
-        let had_next = !matches!(self.way, Way::Idle);
+        let had_next = !matches!(self.connect_state, ConnectState::Idle);
         self.leave_session();
         if close.code == CloseCode::Fenced && had_next {
             // Its own next session proved the succession: nobody else has this robot's id.
@@ -561,14 +561,14 @@ async fn next(open: &mut Option<Open>) -> Option<v1::SessionResponse> {
     }
 }
 
-async fn progress(way: &mut Way) -> Woken {
-    match way {
-        Way::Idle => pending().await,
-        Way::Waiting(sleep) => {
+async fn progress(connect_state: &mut ConnectState) -> Woken {
+    match connect_state {
+        ConnectState::Idle => pending().await,
+        ConnectState::Waiting(sleep) => {
             sleep.await;
             Woken::DialNow
         }
-        Way::Dialing(dialing) => Woken::Channel(dialing.await),
-        Way::Greeting(greeting) => Woken::Greeted(greeting.await),
+        ConnectState::Dialing(dialing) => Woken::Channel(dialing.await),
+        ConnectState::Greeting(greeting) => Woken::Greeted(greeting.await),
     }
 }

@@ -88,7 +88,7 @@ impl NoLine {
 }
 
 /// On the way to a line.
-enum Way {
+enum DialState {
     Idle,
     Waiting(Pin<Box<tokio::time::Sleep>>),
     Dialing(Boxed<'static, Result<Open, NoLine>>),
@@ -111,7 +111,7 @@ pub(crate) struct Line {
     dial: Arc<dyn Dial>,
     rng: rand::rngs::StdRng,
     open: Option<Open>,
-    way: Way,
+    dial_state: DialState,
     failures: u32,
     /// Since when there is no line that works.
     without: Instant,
@@ -130,7 +130,7 @@ impl Line {
             dial,
             rng: rand::rngs::StdRng::seed_from_u64(seed ^ 0x7374_6f70),
             open: None,
-            way: Way::Waiting(Box::pin(tokio::time::sleep(Duration::ZERO))),
+            dial_state: DialState::Waiting(Box::pin(tokio::time::sleep(Duration::ZERO))),
             failures: 0,
             without: Instant::now(),
             refused: Repeats::default(),
@@ -142,11 +142,11 @@ impl Line {
 
     /// What it brings next. May be dropped and called again at any time.
     pub(crate) async fn next(&mut self) -> LineEvent {
-        let Self { open, way, saving, .. } = self;
+        let Self { open, dial_state, saving, .. } = self;
         tokio::select! {
             biased;
             message = heard(open) => LineEvent::Heard(message.map(Box::new)),
-            said = progress(way) => { *way = Way::Idle; said }
+            said = progress(dial_state) => { *dial_state = DialState::Idle; said }
             (storage, number, done) = written(saving) => { *saving = None; LineEvent::Saved(storage, number, done) }
         }
     }
@@ -156,7 +156,7 @@ impl Line {
         let first = attend(robot_id, boot_id, stops);
         let opening = open(self.dial.clone(), first);
         let limit = Duration::from_millis(limits::CHECK_IN_MISSED.as_ms());
-        self.way = Way::Dialing(Box::pin(async move {
+        self.dial_state = DialState::Dialing(Box::pin(async move {
             tokio::time::timeout(limit, opening).await.unwrap_or_else(|_| Err(NoLine::failed("nobody answers")))
         }));
     }
@@ -194,7 +194,7 @@ impl Line {
                     Some(StopNews::CheckInAnswer { nonce, generation })
                 }
                 Ok(FromStop::MoveOver) => {
-                    if matches!(self.way, Way::Idle) {
+                    if matches!(self.dial_state, DialState::Idle) {
                         let pause = self.rng.random_range(SOON_MS);
                         self.wait(pause);
                     }
@@ -251,7 +251,7 @@ impl Line {
             self.without = Instant::now();
         }
         self.open = None;
-        if matches!(self.way, Way::Idle) {
+        if matches!(self.dial_state, DialState::Idle) {
             self.wait_to_dial(None);
         }
     }
@@ -292,7 +292,7 @@ impl Line {
     }
 
     fn wait(&mut self, pause_ms: u64) {
-        self.way = Way::Waiting(Box::pin(tokio::time::sleep(Duration::from_millis(pause_ms))));
+        self.dial_state = DialState::Waiting(Box::pin(tokio::time::sleep(Duration::from_millis(pause_ms))));
     }
 }
 
@@ -337,14 +337,14 @@ async fn heard(open: &mut Option<Open>) -> Option<v1::AttendResponse> {
     }
 }
 
-async fn progress(way: &mut Way) -> LineEvent {
-    match way {
-        Way::Idle => pending().await,
-        Way::Waiting(sleep) => {
+async fn progress(dial_state: &mut DialState) -> LineEvent {
+    match dial_state {
+        DialState::Idle => pending().await,
+        DialState::Waiting(sleep) => {
             sleep.await;
             LineEvent::DialNow
         }
-        Way::Dialing(dialing) => LineEvent::Dialed(dialing.await),
+        DialState::Dialing(dialing) => LineEvent::Dialed(dialing.await),
     }
 }
 

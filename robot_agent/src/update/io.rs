@@ -40,14 +40,14 @@ pub trait Remote: fmt::Debug + Send + Sync {
     /// A range of content, or of a shorter way to it. `NotFound`: there is none.
     async fn range(&self, digest: &Digest, range: Range<u64>) -> io::Result<Pieces>;
     /// How content is best fetched by a robot that has `bases`. A repository without shorter ways says: as it is.
-    async fn way(&self, _wanted: &FileRef, _bases: &[Digest]) -> io::Result<Way> {
-        Ok(Way::AsItIs)
+    async fn plan_download(&self, _wanted: &FileRef, _bases: &[Digest]) -> io::Result<DownloadPlan> {
+        Ok(DownloadPlan::AsItIs)
     }
 }
 
 /// How content is best fetched.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Way {
+pub enum DownloadPlan {
     /// As it is.
     AsItIs,
     /// Something shorter that it can be made of, from `base` if that is a patch.
@@ -314,7 +314,9 @@ impl UpdateWorker {
 
     /// A shorter way that the server names and that can lead there.
     async fn shorter(&self, wanted: FileRef, bases: &[Digest]) -> Result<Option<(Option<Digest>, FileRef)>, Stop> {
-        let Way::Shorter { base, encoded } = self.remote.way(&wanted, bases).await.map_err(unreached)? else {
+        let DownloadPlan::Shorter { base, encoded } =
+            self.remote.plan_download(&wanted, bases).await.map_err(unreached)?
+        else {
             return Ok(None);
         };
         let is_one = encoded.length > 0 && encoded.length < wanted.length && encoded.digest != wanted.digest;

@@ -3,7 +3,7 @@
 //! Invariant: a piece is handed on only if it follows the one before and arrived as it was sent. Called by
 //! [`super::io`].
 
-use super::io::{Pieces, Remote, Way};
+use super::io::{DownloadPlan, Pieces, Remote};
 use crate::sets::FileRef;
 use crate::transport::bulk::{Bulk, Lease, SILENCE, silent};
 use async_trait::async_trait;
@@ -58,15 +58,17 @@ impl Remote for GrpcRemote {
         }
     }
 
-    async fn way(&self, wanted: &FileRef, bases: &[Digest]) -> io::Result<Way> {
+    async fn plan_download(&self, wanted: &FileRef, bases: &[Digest]) -> io::Result<DownloadPlan> {
         let lease = self.bulk.lease().await?;
         let base_digests = bases.iter().take(limits::ENCODING_BASES_MAX).map(Digest::to_string).collect();
         let request = GetEncodingRequest { digest: wanted.digest.to_string(), base_digests };
         let mut client = ChunkServiceClient::new(lease.channel.clone());
         match tokio::time::timeout(SILENCE, client.get_encoding(request)).await {
-            Ok(Ok(answer)) => Ok(way(&answer.into_inner())),
+            Ok(Ok(answer)) => Ok(download_plan(&answer.into_inner())),
             // A server from before, or one that cannot: the file says itself whether it is there.
-            Ok(Err(status)) if matches!(status.code(), Code::Unimplemented | Code::NotFound) => Ok(Way::AsItIs),
+            Ok(Err(status)) if matches!(status.code(), Code::Unimplemented | Code::NotFound) => {
+                Ok(DownloadPlan::AsItIs)
+            }
             Ok(Err(status)) => Err(lease.refused(&status)),
             Err(_) => {
                 lease.spoil();
@@ -98,16 +100,16 @@ impl Remote for GrpcRemote {
 }
 
 /// What an answer says; one that makes no sense is none.
-fn way(answer: &GetEncodingResponse) -> Way {
+fn download_plan(answer: &GetEncodingResponse) -> DownloadPlan {
     let encoded = |digest: Digest| FileRef { digest, length: answer.encoded_length };
     let base = match answer.encoding() {
         Encoding::Zstd => Ok(None),
         Encoding::ZstdPatch => answer.base_digest.parse().map(Some),
-        Encoding::Identity | Encoding::Unspecified => return Way::AsItIs,
+        Encoding::Identity | Encoding::Unspecified => return DownloadPlan::AsItIs,
     };
     match (base, answer.encoded_digest.parse().map(encoded)) {
-        (Ok(base), Ok(encoded)) => Way::Shorter { base, encoded },
-        _ => Way::AsItIs,
+        (Ok(base), Ok(encoded)) => DownloadPlan::Shorter { base, encoded },
+        _ => DownloadPlan::AsItIs,
     }
 }
 

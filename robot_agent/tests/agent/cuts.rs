@@ -31,7 +31,7 @@ pub fn server_says(rig: &mut Rig, order: &mut Order, grants: &mut u64, back: boo
 
 /// What happens to one update on its way.
 #[derive(Clone, Copy, Debug)]
-struct Way {
+struct Course {
     /// The server wants it back once it is on trial.
     back: bool,
     /// It brings an operating system, and a program that migrates data.
@@ -40,7 +40,7 @@ struct Way {
     dies: bool,
 }
 
-impl Way {
+impl Course {
     fn all() -> impl Iterator<Item = Self> {
         (0..8).map(|n| Self { back: n & 1 != 0, bases: n & 2 != 0, dies: n & 4 != 0 })
     }
@@ -56,9 +56,9 @@ struct Ended {
 }
 
 /// One update to its end, with the power going at one of its effects.
-fn with_power_cut(at: Option<usize>, last_is_done: bool, way: Way) -> Ended {
+fn with_power_cut(at: Option<usize>, last_is_done: bool, course: Course) -> Ended {
     let (rig, releases) = connected();
-    let release = |version| if way.bases { releases.release_base(version) } else { releases.release(version) };
+    let release = |version| if course.bases { releases.release_base(version) } else { releases.release(version) };
     let first = release("1.1.0");
     let mut rig = committed(rig, &releases, &first, 1);
     a_day_passes(&mut rig, &releases);
@@ -70,12 +70,12 @@ fn with_power_cut(at: Option<usize>, last_is_done: bool, way: Way) -> Ended {
     let before = updates.effects;
     (updates.cut_at, updates.last_is_done) = (at.map(|at| before + at), last_is_done);
     for _ in 0..200 {
-        server_says(&mut rig, &mut order, &mut grants, way.back);
+        server_says(&mut rig, &mut order, &mut grants, course.back);
         rig.pass(2_000);
         let updates = rig.updates.as_ref().expect("has them");
         if updates.dark {
             updates.sets.lose_power();
-            if way.dies && switch(&rig).trial.is_some() {
+            if course.dies && switch(&rig).trial.is_some() {
                 updates.sets.fall_back(2);
                 fell = true;
             }
@@ -91,14 +91,14 @@ fn with_power_cut(at: Option<usize>, last_is_done: bool, way: Way) -> Ended {
         if let Some(told) = told.filter(ended).filter(|_| !migrates) {
             let is_committed = told.state == UpdateState::Committed;
             let migrated = migrations(&rig);
-            assert_eq!(migrated.contains(&"1.2.0".to_owned()), way.bases && is_committed, "{migrated:?}");
+            assert_eq!(migrated.contains(&"1.2.0".to_owned()), course.bases && is_committed, "{migrated:?}");
             boots_something_whole(&rig, &good);
             let effects = rig.updates.as_ref().map_or(0, |u| u.effects) - before;
             all_agree(&mut rig, &told, &good);
             return Ended { state: told.state, effects, fell };
         }
     }
-    panic!("never ended: power went at {at:?} of {way:?}, {:?}", report(&rig));
+    panic!("never ended: power went at {at:?} of {course:?}, {:?}", report(&rig));
 }
 
 /// Ledger, switch record and what the server is told say the same of an update that is over.
@@ -137,20 +137,20 @@ fn boots_something_whole(rig: &Rig, good: &str) {
 
 #[test]
 fn the_power_may_go_at_every_effect_of_an_update_and_its_set_may_die_after_it_and_it_still_ends() {
-    for way in Way::all() {
-        let wanted = if way.back { UpdateState::RolledBack } else { UpdateState::Committed };
-        let undisturbed = with_power_cut(None, false, way);
+    for course in Course::all() {
+        let wanted = if course.back { UpdateState::RolledBack } else { UpdateState::Committed };
+        let undisturbed = with_power_cut(None, false, course);
         assert_eq!((undisturbed.state, undisturbed.fell), (wanted, false));
         assert!(undisturbed.effects > 20, "only {} effects", undisturbed.effects);
         let mut fell = 0;
         for at in 1..=undisturbed.effects {
             for last_is_done in [false, true] {
-                let ended = with_power_cut(Some(at), last_is_done, way);
+                let ended = with_power_cut(Some(at), last_is_done, course);
                 let end = if ended.fell { UpdateState::RolledBack } else { wanted };
-                assert_eq!(ended.state, end, "the power went at {at}, done: {last_is_done}, {way:?}");
+                assert_eq!(ended.state, end, "the power went at {at}, done: {last_is_done}, {course:?}");
                 fell += usize::from(ended.fell);
             }
         }
-        assert_eq!(fell > 4, way.dies, "{fell} sets fell: {way:?}");
+        assert_eq!(fell > 4, course.dies, "{fell} sets fell: {course:?}");
     }
 }

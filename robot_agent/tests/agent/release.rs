@@ -3,7 +3,7 @@
 use async_trait::async_trait;
 use midshift_agent::sets::FileRef;
 use midshift_agent::update::UpdateConfig;
-use midshift_agent::update::io::{Pieces, Remote, Way};
+use midshift_agent::update::io::{DownloadPlan, Pieces, Remote};
 use midshift_bundle::digest::Digest;
 use midshift_bundle::directive::{Directive, LIFE_MS};
 use midshift_bundle::key_set::KeySet;
@@ -48,7 +48,7 @@ struct Shelf {
     /// Bytes that went out.
     served: u64,
     /// What is said of ways to a file, first one first; the last stays.
-    ways: BTreeMap<Digest, Vec<Way>>,
+    ways: BTreeMap<Digest, Vec<DownloadPlan>>,
     asked: Vec<Vec<Digest>>,
     /// Seed of the directive key that robots are set up with; none: 7.
     trust: Option<u8>,
@@ -280,7 +280,7 @@ impl Releases {
         self.shelf().bytes.remove(digest);
     }
     /// Says this of ways to a file from now on, one after the other.
-    pub fn ways(&self, wanted: &FileRef, mut ways: Vec<Way>) {
+    pub fn ways(&self, wanted: &FileRef, mut ways: Vec<DownloadPlan>) {
         ways.reverse();
         self.shelf().ways.insert(wanted.digest, ways);
     }
@@ -295,14 +295,14 @@ impl Releases {
 
 #[async_trait]
 impl Remote for Releases {
-    async fn way(&self, wanted: &FileRef, bases: &[Digest]) -> io::Result<Way> {
+    async fn plan_download(&self, wanted: &FileRef, bases: &[Digest]) -> io::Result<DownloadPlan> {
         let mut shelf = self.shelf();
         if shelf.cut {
             return Err(io::ErrorKind::NotConnected.into());
         }
         shelf.asked.push(bases.to_vec());
-        let Some(ways) = shelf.ways.get_mut(&wanted.digest) else { return Ok(Way::AsItIs) };
-        Ok(if ways.len() > 1 { ways.pop() } else { ways.last().copied() }.unwrap_or(Way::AsItIs))
+        let Some(ways) = shelf.ways.get_mut(&wanted.digest) else { return Ok(DownloadPlan::AsItIs) };
+        Ok(if ways.len() > 1 { ways.pop() } else { ways.last().copied() }.unwrap_or(DownloadPlan::AsItIs))
     }
     async fn metadata(&self, name: &str) -> io::Result<Option<Vec<u8>>> {
         let shelf = self.shelf();

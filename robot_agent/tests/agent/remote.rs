@@ -8,7 +8,7 @@ use midshift_agent::bulk::{Bulk, IDLE, SILENCE};
 use midshift_agent::dial::{self, Dial, TcpDial};
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::sets::{CHUNK_BYTES, FileRef, Sets};
-use midshift_agent::update::io::{Remote, UpdateWorker, Way, Worker};
+use midshift_agent::update::io::{DownloadPlan, Remote, UpdateWorker, Worker};
 use midshift_agent::update::remote::GrpcRemote;
 use midshift_agent::update::{Done, Failure, Job};
 use midshift_bundle::digest::Digest;
@@ -243,10 +243,10 @@ impl Bench {
         *self.shop.wrong.lock().expect("not poisoned") = wrong;
     }
     /// What the robot makes of an answer about ways.
-    async fn way(&self, answer: GetEncodingResponse) -> Way {
+    async fn plan_download(&self, answer: GetEncodingResponse) -> DownloadPlan {
         *self.shop.encoding.lock().expect("not poisoned") = answer;
         let wanted = FileRef { digest: Digest::of_content(b"new"), length: 1_000 };
-        self.remote.way(&wanted, &[Digest::of_content(b"old")]).await.expect("answers")
+        self.remote.plan_download(&wanted, &[Digest::of_content(b"old")]).await.expect("answers")
     }
     fn connections(&self) -> (usize, usize) {
         (*self.open.borrow(), *self.dialed.borrow())
@@ -410,9 +410,9 @@ async fn a_shorter_way_is_asked_for_with_what_is_there_and_an_answer_without_sen
         encoded_length: 7,
     };
     let encoded = FileRef { digest: way, length: 7 };
-    assert_eq!(bench.way(answer.clone()).await, Way::Shorter { base: Some(old), encoded });
+    assert_eq!(bench.plan_download(answer.clone()).await, DownloadPlan::Shorter { base: Some(old), encoded });
     let zstd = GetEncodingResponse { encoding: Encoding::Zstd.into(), ..answer.clone() };
-    assert_eq!(bench.way(zstd).await, Way::Shorter { base: None, encoded });
+    assert_eq!(bench.plan_download(zstd).await, DownloadPlan::Shorter { base: None, encoded });
     let senseless = [
         GetEncodingResponse::default(),
         GetEncodingResponse { encoding: 77, ..answer.clone() },
@@ -421,14 +421,14 @@ async fn a_shorter_way_is_asked_for_with_what_is_there_and_an_answer_without_sen
         GetEncodingResponse { encoded_digest: "x".to_owned(), ..answer.clone() },
     ];
     for answer in senseless {
-        assert_eq!(bench.way(answer.clone()).await, Way::AsItIs, "{answer:?}");
+        assert_eq!(bench.plan_download(answer.clone()).await, DownloadPlan::AsItIs, "{answer:?}");
     }
     let asked = bench.shop.asked.lock().expect("not poisoned")[0].clone();
     let expected =
         GetEncodingRequest { digest: Digest::of_content(b"new").to_string(), base_digests: vec![old.to_string()] };
     assert_eq!(asked, expected);
     bench.server_is(Wrong::Old);
-    assert_eq!(bench.way(answer).await, Way::AsItIs);
+    assert_eq!(bench.plan_download(answer).await, DownloadPlan::AsItIs);
     bench.server_is(Wrong::Refuses);
-    assert!(bench.remote.way(&encoded, &[]).await.is_err());
+    assert!(bench.remote.plan_download(&encoded, &[]).await.is_err());
 }

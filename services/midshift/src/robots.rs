@@ -4,7 +4,7 @@ use crate::enrol_simulated::{Machines, Replace, Replaced};
 use crate::software::{self, Behaving};
 use anyhow::{Context, bail};
 use midshift_agent::core::ExitReason;
-use midshift_agent::program::{Machine, Ways};
+use midshift_agent::program::{Machine, RunOptions};
 use midshift_cli::endpoint::{Endpoint, with_scheme};
 use midshift_cli::site_file;
 use midshift_core::Boxed;
@@ -172,7 +172,7 @@ async fn one_agent(args: AgentRun, hand: Hand, stop: CancellationToken) -> anyho
         pulse = software.pulse(pulse, &clock);
     }
     let (network, stop_network) = (Some(handle.network()), Some(handle.stop_network()));
-    Ok(machine.run(Box::new(handle), Ways { network, stop_network, pulse }, stop).await?)
+    Ok(machine.run(Box::new(handle), RunOptions { network, stop_network, pulse }, stop).await?)
 }
 
 /// A person who looks after one robot.

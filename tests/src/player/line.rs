@@ -59,7 +59,7 @@ impl Line {
             tokio::time::sleep(PAUSE).await;
         }
     }
-    async fn open(&self, hello: SessionRequest) -> Result<Ways, End> {
+    async fn open(&self, hello: SessionRequest) -> Result<SessionStreams, End> {
         let (up, words) = mpsc::channel(UP_MAX);
         up.try_send(hello).map_err(|_| End::Own)?;
         let mut client = LinkServiceClient::new(self.dial.dial().await.map_err(|_| End::Own)?);
@@ -116,7 +116,7 @@ impl Line {
 }
 
 /// The way up and the way down.
-type Ways = (mpsc::Sender<SessionRequest>, Streaming<SessionResponse>);
+type SessionStreams = (mpsc::Sender<SessionRequest>, Streaming<SessionResponse>);
 
 async fn ends(down: &mut Streaming<SessionResponse>) -> End {
     loop {

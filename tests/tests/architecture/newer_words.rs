@@ -54,6 +54,7 @@ const WORDS: &[(&str, &[&str])] = &[
             "AbortScope",
             "Command",
             "Kind",
+            "LaneTraffic",
             "Revocation",
             "Rule",
             "SmallWave",
@@ -61,7 +62,6 @@ const WORDS: &[(&str, &[&str])] = &[
             "Source",
             "Verb",
             "Wave",
-            "Ways",
         ],
     ),
 ];

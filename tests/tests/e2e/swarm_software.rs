@@ -9,11 +9,11 @@ use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_bundle::build;
 use midshift_bundle::digest::Digest;
 use midshift_bundle::directive::{Directive, LIFE_MS};
+use midshift_bundle::encoded_target::EncodedTarget;
 use midshift_bundle::folder::{Folder, Signed};
 use midshift_bundle::installed;
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::repository::{Profile, listed};
-use midshift_bundle::ways::Way;
 use midshift_cli::samples::{self, Made, Signer};
 use midshift_core::authority::Authority;
 use midshift_core::desired_state::DesiredWork;
@@ -275,7 +275,7 @@ impl Bench {
             Folder::open(&self.made.repository)?.document(&format!("{}.targets.json", self.made.targets_version));
         let files = listed(&targets?.context("no targets")?)?;
         let behaviour = |nth: usize| self.made.bundles[nth].1.components[0].digest;
-        let name = Way { to: behaviour(to), from: from.map(behaviour) }.target();
+        let name = EncodedTarget { to: behaviour(to), from: from.map(behaviour) }.target();
         Ok(files.into_iter().find(|file| file.name == name).with_context(|| format!("no {name}"))?.length)
     }
 
@@ -476,7 +476,7 @@ fn long_releases(dir: &Path) -> anyhow::Result<Made> {
         )?;
         std::fs::write(draft.join("settings"), long_settings(speed_permille))?;
         let manifest = build::build(&draft, &bundle, &mut |_| {})?;
-        let (_, signed) = folder.add_with_ways(&bundle, &[], &[&key], BEGIN)?;
+        let (_, signed) = folder.add_with_encoded_targets(&bundle, &[], &[&key], BEGIN)?;
         let Signed::Published(targets_version) = signed else { anyhow::bail!("one key is not enough") };
         made.targets_version = targets_version;
         made.bundles.push((bundle, manifest));

@@ -2,7 +2,7 @@
 //! the witness holds in them too.
 
 use crate::directed::{Scene, config, waves};
-use crate::net::Way;
+use crate::net::LineState;
 use crate::orders::Order;
 use crate::room::{Naive, RoomConfig};
 use crate::run::steer;
@@ -149,7 +149,7 @@ fn never_reaches_its_server(seed: u64, alone: bool) -> (Scene, usize) {
     scene.begin("first", GOOD[0], |_| {});
     let canary = scene.some_is_in(UpdateState::Switching);
     let cut: Vec<usize> = if alone { vec![canary] } else { scene.all().into_iter().collect() };
-    cut.iter().for_each(|robot| steer(&mut scene.room, *robot, Way::Cut));
+    cut.iter().for_each(|robot| steer(&mut scene.room, *robot, LineState::Cut));
     let since_ms = scene.room.now_ms();
     assert_eq!(scene.some_is_in(UpdateState::Probation), canary);
     assert_eq!(scene.runs(canary), scene.bundle(GOOD[0]), "it runs what it was to be tried with");
@@ -166,12 +166,12 @@ fn never_reaches_its_server(seed: u64, alone: bool) -> (Scene, usize) {
     assert_eq!(scene.robots_in(UpdateState::RolledBack), [canary], "it went back without being told");
     assert_eq!(scene.runs(canary), None, "it is on what it kept");
     // It is heard before the others, which tell nothing of the network while they come back.
-    steer(&mut scene.room, canary, Way::Open);
+    steer(&mut scene.room, canary, LineState::Open);
     scene.until("the server to hear it", |room| {
         let seen = room.observer.lock().changes().rollout("first").cloned();
         seen.is_some_and(|row| row.phase.is_over() || row.pauses.is_empty())
     });
-    cut.iter().for_each(|robot| steer(&mut scene.room, *robot, Way::Open));
+    cut.iter().for_each(|robot| steer(&mut scene.room, *robot, LineState::Open));
     (scene, canary)
 }
 

@@ -3,7 +3,7 @@
 
 use crate::client::Wish;
 use crate::disk::Mood;
-use crate::net::Way;
+use crate::net::LineState;
 use crate::orders::Order;
 use crate::room::{Naive, Room, RoomConfig};
 use crate::run::{spec, steer};
@@ -380,14 +380,14 @@ fn an_access_point_that_is_lost_in_probation_stands_the_roll_out_still_and_burns
     scene.begin("unlucky", GOOD[0], |spec| spec.probation = Some(prost_types::Duration { seconds: 10, nanos: 0 }));
     scene.some_is_in(UpdateState::Probation);
     for robot in 0..6 {
-        steer(&mut scene.room, robot, Way::Cut);
+        steer(&mut scene.room, robot, LineState::Cut);
     }
     scene.until("the roll-out to stand still", |room| {
         let infrastructure = |row: &Rollout| row.pauses.contains(&Pause::Infrastructure);
         room.observer.lock().changes().rollout("unlucky").is_some_and(infrastructure)
     });
     for robot in 0..6 {
-        steer(&mut scene.room, robot, Way::Open);
+        steer(&mut scene.room, robot, LineState::Open);
     }
     let row = scene.ends("unlucky");
     assert_eq!((row.phase, &row.abort), (Phase::Completed, &None));
@@ -401,12 +401,12 @@ fn a_canary_that_alone_is_lost_in_probation_counts_against_its_bundle() {
     let mut scene = Scene::open(31, 6);
     scene.begin("lost", GOOD[0], |spec| spec.probation = Some(prost_types::Duration { seconds: 10, nanos: 0 }));
     let canary = scene.some_is_in(UpdateState::Probation);
-    steer(&mut scene.room, canary, Way::Cut);
+    steer(&mut scene.room, canary, LineState::Cut);
     let row = scene.ends("lost");
     assert_eq!(row.phase, Phase::Aborted);
     assert_eq!(row.verdicts.last().map(|v| (v.attempted, v.robots.outcomes.failed)), Some((1, 1)), "{row:?}");
     assert!(row.pauses.is_empty(), "{row:?}");
-    steer(&mut scene.room, canary, Way::Open);
+    steer(&mut scene.room, canary, LineState::Open);
     scene.comes_to_rest();
     scene.all_run(None);
 }
@@ -423,21 +423,21 @@ fn a_pause_whose_answers_are_lost_holds_in_the_middle_of_a_wave_and_the_roll_out
     // The server's disk is slow to say that the pause is written; then nothing comes through any more, and what it says to robots waits.
     scene.room.disk.set(Mood { slow_ms: 600, ..Mood::GOOD });
     for robot in 0..4 {
-        steer(&mut scene.room, robot, Way::Held);
+        steer(&mut scene.room, robot, LineState::Held);
     }
     scene.order(Order::Pause("paused".to_owned()));
     scene.until("the pause to be committed", |room| {
         room.observer.lock().changes().rollout("paused").is_some_and(|row| row.pauses.contains(&Pause::Operator))
     });
-    steer(&mut scene.room, 4, Way::Cut);
+    steer(&mut scene.room, 4, LineState::Cut);
     scene.room.disk.set(Mood::GOOD);
     scene.pass(4_000);
     for robot in 0..4 {
-        steer(&mut scene.room, robot, Way::Open);
+        steer(&mut scene.room, robot, LineState::Open);
     }
     scene.pass(10_000);
     assert!(scene.room.desk.unanswered.get() > 0, "the answer was lost");
-    steer(&mut scene.room, 4, Way::Open);
+    steer(&mut scene.room, 4, LineState::Open);
     scene.answered();
     let before = scene.activations();
     scene.pass(30_000);

@@ -4,7 +4,7 @@
 
 use crate::directed::{Scene, config};
 use crate::frame::Frame;
-use crate::net::Way;
+use crate::net::LineState;
 use crate::newer::Newer;
 use crate::orders::Order;
 use crate::room::{Naive, RoomConfig};
@@ -67,9 +67,9 @@ fn said() -> Vec<Frame> {
     let stop_id = crate::stops::effective(&scene.room.stop.as_ref().expect("a stop service").latch()).pop_first();
     scene.order(Order::Reset(stop_id.expect("one is engaged").to_string()));
     scene.pass(5_000);
-    steer(&mut scene.room, 0, Way::Cut);
+    steer(&mut scene.room, 0, LineState::Cut);
     scene.pass(120_000);
-    steer(&mut scene.room, 0, Way::Open);
+    steer(&mut scene.room, 0, LineState::Open);
     scene.pass(60_000);
     assert_eq!(scene.findings(), [] as [String; 0]);
     newer.frames()

@@ -1,7 +1,7 @@
 //! Twins of roll-outs: each naive rule is led into the situation that it gets wrong, and its law must be seen broken.
 
 use crate::directed::Scene;
-use crate::net::Way;
+use crate::net::LineState;
 use crate::orders::Order;
 use crate::room::Naive;
 use crate::run::steer;
@@ -50,12 +50,12 @@ fn a_drain_that_time_releases_gives_work_to_a_robot_on_probation() {
     breaks(60, 3, rollouts(Rollouts::TimeReleasesDrain), law, |scene| {
         scene.begin("r", GOOD[0], |spec| spec.probation = seconds(120));
         let canary = scene.some_is_in(UpdateState::Switching);
-        steer(&mut scene.room, canary, Way::Cut);
+        steer(&mut scene.room, canary, LineState::Cut);
         scene.pass(8_000);
         scene.order(Order::Pause("r".to_owned()));
         scene.pass(4_000);
         scene.work(6);
-        steer(&mut scene.room, canary, Way::Open);
+        steer(&mut scene.room, canary, LineState::Open);
         scene.pass(80_000);
     });
 }
@@ -66,10 +66,10 @@ fn a_pause_that_is_forgotten_lets_robots_change_after_it() {
     breaks(61, 3, rollouts(Rollouts::PauseIsForgotten), law, |scene| {
         scene.begin("r", GOOD[0], |_| {});
         scene.comes_to("r", Phase::Applying);
-        (0..3).for_each(|robot| steer(&mut scene.room, robot, Way::Held));
+        (0..3).for_each(|robot| steer(&mut scene.room, robot, LineState::Held));
         scene.order(Order::Pause("r".to_owned()));
         scene.pass(8_000);
-        (0..3).for_each(|robot| steer(&mut scene.room, robot, Way::Open));
+        (0..3).for_each(|robot| steer(&mut scene.room, robot, LineState::Open));
         scene.pass(60_000);
     });
 }

@@ -28,7 +28,7 @@ const PORT: u16 = 7420;
 
 /// How the way between the server and one machine is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Way {
+pub enum LineState {
     /// Everything passes.
     #[default]
     Open,
@@ -49,7 +49,7 @@ pub struct Wire(Arc<Mutex<WireState>>);
 
 #[derive(Default)]
 struct WireState {
-    ways: BTreeMap<String, Way>,
+    ways: BTreeMap<String, LineState>,
     deaf: BTreeMap<String, bool>,
     hits: BTreeMap<&'static str, u64>,
 }
@@ -59,7 +59,7 @@ impl Wire {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
     /// The way to a machine is this from now on; what it was.
-    pub fn set_way(&self, machine: &str, way: Way) -> Way {
+    pub fn set_way(&self, machine: &str, way: LineState) -> LineState {
         self.state().ways.insert(machine.to_owned(), way).unwrap_or_default()
     }
     /// A machine hears nothing from now on, or hears again.
@@ -74,9 +74,9 @@ impl Wire {
         let mut state = self.state();
         let way = state.ways.get(machine).copied().unwrap_or_default();
         let hit = match (way, up) {
-            (Way::Cut | Way::CutUp, true) => "message of a robot lost",
-            (Way::Cut | Way::CutDown, false) => "message to a robot lost",
-            (Way::Held, _) => "message held on its way",
+            (LineState::Cut | LineState::CutUp, true) => "message of a robot lost",
+            (LineState::Cut | LineState::CutDown, false) => "message to a robot lost",
+            (LineState::Held, _) => "message held on its way",
             _ if !up && state.deaf.get(machine) == Some(&true) => "message kept from a robot's ear",
             _ => return,
         };

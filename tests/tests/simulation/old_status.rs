@@ -1,7 +1,7 @@
 //! Old STATUS in the same room, directed: a robot that was away for long, and what breaks while it gives what it kept.
 
 use crate::directed::Scene;
-use crate::net::Way;
+use crate::net::LineState;
 use crate::run::steer;
 
 /// A robot that made so many samples, at one in two seconds, while nobody heard it.
@@ -22,10 +22,10 @@ fn stored(scene: &Scene, robot: usize) -> u64 {
 /// Robot 0 was away and is back.
 fn back(seed: u64) -> Scene {
     let mut scene = Scene::open(seed, 2);
-    steer(&mut scene.room, 0, Way::Cut);
+    steer(&mut scene.room, 0, LineState::Cut);
     scene.pass(AWAY_MS);
     assert!(backlog(&scene, 0) > AWAY_SAMPLES && backlog(&scene, 1) <= UNDER_WAY);
-    steer(&mut scene.room, 0, Way::Open);
+    steer(&mut scene.room, 0, LineState::Open);
     scene
 }
 
@@ -54,12 +54,12 @@ fn a_robot_that_was_away_gives_its_status_in_order_and_once() {
 
 #[test]
 fn a_way_that_breaks_in_the_middle_of_it_loses_nothing_and_brings_nothing_twice() {
-    for (seed, way) in [(91, Way::Cut), (92, Way::CutDown), (93, Way::CutUp), (94, Way::Held)] {
+    for (seed, way) in [(91, LineState::Cut), (92, LineState::CutDown), (93, LineState::CutUp), (94, LineState::Held)] {
         let mut scene = back(seed);
         some_of_it_comes(&mut scene);
         steer(&mut scene.room, 0, way);
         scene.pass(30_000);
-        steer(&mut scene.room, 0, Way::Open);
+        steer(&mut scene.room, 0, LineState::Open);
         all_of_it_comes(&mut scene);
     }
 }

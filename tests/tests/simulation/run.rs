@@ -4,7 +4,7 @@ use crate::client::Wish;
 use crate::counted;
 use crate::disk::Mood;
 use crate::incidents;
-use crate::net::{SERVER, Way, machine};
+use crate::net::{LineState, SERVER, machine};
 use crate::orders::Order;
 use crate::plan::{Deed, Fault, Plan, ROBOTS};
 use crate::room::{CLIENT, Naive, Room, RoomConfig, site};
@@ -270,7 +270,7 @@ impl Shift {
             self.room.ears[robot].hold(deaf);
             self.room.wire.set_deaf(&machine(robot), deaf);
         }
-        self.set_way(ROBOTS, if now.contains(&Fault::ClientCut) { Way::Cut } else { way(&now, ROBOTS) });
+        self.set_way(ROBOTS, if now.contains(&Fault::ClientCut) { LineState::Cut } else { way(&now, ROBOTS) });
         let down = now.iter().any(|f| matches!(f, Fault::ServerCrash { .. }));
         if down != self.server_down {
             self.server_down = down;
@@ -359,7 +359,7 @@ impl Shift {
         hits.into_iter().for_each(|hit| *self.hits.entry(hit).or_insert(0) += 1);
     }
 
-    fn set_way(&mut self, index: usize, way: Way) {
+    fn set_way(&mut self, index: usize, way: LineState) {
         steer(&mut self.room, index, way);
     }
 }
@@ -372,7 +372,7 @@ fn replayed() -> u64 {
 }
 
 /// Makes the way between the server and a machine so; the clients come after the robots.
-pub fn steer(room: &mut Room, index: usize, way: Way) {
+pub fn steer(room: &mut Room, index: usize, way: LineState) {
     let other = if index == room.ears.len() { CLIENT.to_owned() } else { machine(index) };
     let (sim, other) = (&room.sim, other.as_str());
     let old = room.wire.set_way(other, way);
@@ -380,18 +380,18 @@ pub fn steer(room: &mut Room, index: usize, way: Way) {
         return;
     }
     match old {
-        Way::Open => {}
-        Way::Cut => sim.repair(SERVER, other),
-        Way::CutDown => sim.repair_oneway(SERVER, other),
-        Way::CutUp => sim.repair_oneway(other, SERVER),
-        Way::Held => sim.release(SERVER, other),
+        LineState::Open => {}
+        LineState::Cut => sim.repair(SERVER, other),
+        LineState::CutDown => sim.repair_oneway(SERVER, other),
+        LineState::CutUp => sim.repair_oneway(other, SERVER),
+        LineState::Held => sim.release(SERVER, other),
     }
     match way {
-        Way::Open => {}
-        Way::Cut => sim.partition(SERVER, other),
-        Way::CutDown => sim.partition_oneway(SERVER, other),
-        Way::CutUp => sim.partition_oneway(other, SERVER),
-        Way::Held => sim.hold(SERVER, other),
+        LineState::Open => {}
+        LineState::Cut => sim.partition(SERVER, other),
+        LineState::CutDown => sim.partition_oneway(SERVER, other),
+        LineState::CutUp => sim.partition_oneway(other, SERVER),
+        LineState::Held => sim.hold(SERVER, other),
     }
 }
 
@@ -413,18 +413,18 @@ pub fn spec(room: &Room, version: &str, robots: &BTreeSet<usize>) -> RolloutSpec
 }
 
 /// The worst of what is under way for one machine.
-fn way(now: &[Fault], index: usize) -> Way {
+fn way(now: &[Fault], index: usize) -> LineState {
     let of_one = |fault: &Fault| match fault {
-        Fault::ServerCrash { power: true } => Way::Cut,
-        Fault::Partition(robots) if robots.contains(&index) => Way::Cut,
-        Fault::AgentCrash { robot, power: true } if *robot == index => Way::Cut,
-        Fault::Deaf(robot) if *robot == index => Way::CutDown,
-        Fault::Mute(robot) if *robot == index => Way::CutUp,
-        Fault::Hold(robot) if *robot == index => Way::Held,
-        _ => Way::Open,
+        Fault::ServerCrash { power: true } => LineState::Cut,
+        Fault::Partition(robots) if robots.contains(&index) => LineState::Cut,
+        Fault::AgentCrash { robot, power: true } if *robot == index => LineState::Cut,
+        Fault::Deaf(robot) if *robot == index => LineState::CutDown,
+        Fault::Mute(robot) if *robot == index => LineState::CutUp,
+        Fault::Hold(robot) if *robot == index => LineState::Held,
+        _ => LineState::Open,
     };
-    let ways: Vec<Way> = now.iter().map(of_one).collect();
-    let worst = [Way::Cut, Way::CutDown, Way::CutUp, Way::Held];
+    let ways: Vec<LineState> = now.iter().map(of_one).collect();
+    let worst = [LineState::Cut, LineState::CutDown, LineState::CutUp, LineState::Held];
     worst.into_iter().find(|w| ways.contains(w)).unwrap_or_default()
 }
 

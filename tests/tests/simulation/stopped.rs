@@ -2,7 +2,7 @@
 //! worked. Every law of the witness holds in these too.
 
 use crate::directed::{Scene, config};
-use crate::net::{STOPS, Way};
+use crate::net::{LineState, STOPS};
 use crate::orders::Order;
 use crate::room::{Naive, Room, RoomConfig};
 use crate::stops::{Stops, effective};
@@ -124,7 +124,7 @@ impl Stopped {
         }
         panic!("a robot was not let go: {:?}", (0..ROBOTS).map(|robot| self.stops().saved(robot)).collect::<Vec<_>>());
     }
-    fn line(&self, robot: usize, way: Way) {
+    fn line(&self, robot: usize, way: LineState) {
         self.stops().steer(&self.scene.room.sim, robot, way);
     }
     fn effective(&self) -> BTreeSet<StopId> {
@@ -166,8 +166,8 @@ fn suffer(stopped: &mut Stopped, rng: &mut StdRng, down: &mut [Option<u64>; 2], 
             engaged.iter().nth(drawn).iter().for_each(|id| stopped.reset(id));
         }
         5 | 6 => stopped.let_go(),
-        7 | 8 if cut.insert(robot) => stopped.line(robot, Way::Cut),
-        9 | 10 if cut.remove(&robot) => stopped.line(robot, Way::Open),
+        7 | 8 if cut.insert(robot) => stopped.line(robot, LineState::Cut),
+        9 | 10 if cut.remove(&robot) => stopped.line(robot, LineState::Open),
         11 if down[0].is_none() => {
             down[0] = Some(now_ms + rng.random_range(500..8_000));
             stopped.scene.room.sim.crash(STOPS);
@@ -207,7 +207,7 @@ fn keeps_every_law(seed: u64) -> u64 {
     }
     stopped.engage(fleet());
     heal(&mut stopped, &mut down, u64::MAX);
-    cut.iter().for_each(|robot| stopped.line(*robot, Way::Open));
+    cut.iter().for_each(|robot| stopped.line(*robot, LineState::Open));
     stopped.until("all orders to be answered", |room| room.desk.is_empty());
     stopped.pass(HEALED_MS);
     stopped.assert_agrees();
@@ -246,11 +246,11 @@ fn one_of_two_is_reset(naive: Naive) -> Stopped {
     stopped.until("two stops at every robot", |room| {
         (0..ROBOTS).all(|robot| effective(&stops(room).saved(robot).latch).len() == 2)
     });
-    stopped.line(0, Way::Cut);
+    stopped.line(0, LineState::Cut);
     let first = stopped.effective().pop_first().expect("two are engaged");
     stopped.reset(&first);
     stopped.pass(5_000);
-    stopped.line(0, Way::Open);
+    stopped.line(0, LineState::Open);
     stopped.pass(HEALED_MS);
     stopped
 }
@@ -271,7 +271,7 @@ fn a_stop_that_is_engaged_while_a_line_is_cut_reaches_its_robot_by_the_link() {
     let mut stopped = Stopped::open(72, Naive::default());
     stopped.scene.work(8);
     stopped.pass(8_000);
-    stopped.line(0, Way::Cut);
+    stopped.line(0, LineState::Cut);
     stopped.engage(fleet());
     stopped.until("the stop at every robot", |room| {
         (0..ROBOTS).all(|robot| effective(&stops(room).saved(robot).latch).len() == 1)
@@ -284,7 +284,7 @@ fn a_stop_that_is_engaged_while_a_line_is_cut_reaches_its_robot_by_the_link() {
     stopped.until("its reset at every robot", |room| {
         (0..ROBOTS).all(|robot| effective(&stops(room).saved(robot).latch).is_empty())
     });
-    stopped.line(0, Way::Open);
+    stopped.line(0, LineState::Open);
     stopped.pass(HEALED_MS);
     stopped.let_all_go();
     stopped.assert_agrees();
@@ -301,7 +301,7 @@ fn silence_of_the_stop_service_stands_robots_among_people_within_its_bound_and_r
         stopped.pass(3_000);
     }
     assert_eq!(stopped.silences(), 0, "the business server is not asked");
-    (0..ROBOTS).for_each(|robot| stopped.line(robot, Way::Cut));
+    (0..ROBOTS).for_each(|robot| stopped.line(robot, LineState::Cut));
     // Less the second that the last check-in may be old.
     let stand_ms = limits::SILENCE_STAND_PEOPLE.as_ms();
     stopped.pass(stand_ms - 1_500);
@@ -310,7 +310,7 @@ fn silence_of_the_stop_service_stands_robots_among_people_within_its_bound_and_r
     // Who knows that no people are around it has more patience.
     let stood = stopped.silences();
     assert!(stood > 0, "nobody was among people");
-    (0..ROBOTS).for_each(|robot| stopped.line(robot, Way::Open));
+    (0..ROBOTS).for_each(|robot| stopped.line(robot, LineState::Open));
     stopped.pass(HEALED_MS);
     assert_eq!(stopped.silences(), stood, "among people a person ends it");
     stopped.let_all_go();

@@ -3,7 +3,7 @@
 //! Invariant: its folder outlives its process, and what a robot keeps of stops outlives the robot's; everything else dies with its process.
 
 use crate::clock::{MachineClock, Skew, TrueTime};
-use crate::net::{self, Ear, STOPS, SimDial, Way, Wire, machine};
+use crate::net::{self, Ear, LineState, STOPS, SimDial, Wire, machine};
 use crate::newer::Voice;
 use midshift_agent::stop::line::StopLine;
 use midshift_agent::stop::storage::MemoryStops;
@@ -85,11 +85,11 @@ impl Stops {
         self.wire.hits().values().sum()
     }
     /// Makes the line of one robot so: open or cut.
-    pub fn steer(&self, sim: &turmoil::Sim<'static>, robot: usize, way: Way) {
+    pub fn steer(&self, sim: &turmoil::Sim<'static>, robot: usize, way: LineState) {
         let other = machine(robot);
         match (self.wire.set_way(&other, way), way) {
-            (Way::Open, Way::Cut) => sim.partition(STOPS, other.as_str()),
-            (Way::Cut, Way::Open) => sim.repair(STOPS, other.as_str()),
+            (LineState::Open, LineState::Cut) => sim.partition(STOPS, other.as_str()),
+            (LineState::Cut, LineState::Open) => sim.repair(STOPS, other.as_str()),
             _ => {}
         }
     }

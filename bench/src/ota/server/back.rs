@@ -25,7 +25,7 @@ const LONG_MS: u64 = 24 * 3_600_000;
 
 /// One way back.
 #[derive(Clone, Debug)]
-pub struct Way {
+pub struct RollbackTimes {
     /// Seconds until half of the robots had said that they run what they kept.
     pub half_s: f64,
     /// Seconds until all had.
@@ -38,9 +38,9 @@ pub struct Way {
 #[derive(Clone, Debug)]
 pub struct WentBack {
     /// Of a release on trial, aborted by a person.
-    pub on_trial: Way,
+    pub on_trial: RollbackTimes,
     /// Of a completed roll-out, taken back by another.
-    pub committed: Way,
+    pub committed: RollbackTimes,
 }
 
 /// Brings robots a release and takes it back, twice.
@@ -99,7 +99,7 @@ async fn back(
     kept: &BTreeMap<String, String>,
     begun: Instant,
     groups: u64,
-) -> anyhow::Result<Way> {
+) -> anyhow::Result<RollbackTimes> {
     let (back, count) = (|r: &Rollout| r.counts.map_or(0, |c| c.rolled_back), kept.len() as u32);
     rollouts.until(id, LOOK_EVERY, WITHIN, |r| back(r) * 2 >= count).await?;
     let half_s = begun.elapsed().as_secs_f64();
@@ -109,7 +109,7 @@ async fn back(
         tokio::time::sleep(LOOK_EVERY).await;
     }
     let all_s = begun.elapsed().as_secs_f64();
-    Ok(Way { half_s, all_s, groups: (server.ask(GROUPS)? - groups) as f64 })
+    Ok(RollbackTimes { half_s, all_s, groups: (server.ask(GROUPS)? - groups) as f64 })
 }
 
 /// What each robot runs, as it said.

@@ -129,7 +129,7 @@ fn of_ways(robots: usize, ways: &[WentBack], syncs_ms: &[f64]) -> Vec<Figure> {
         return Vec::new();
     }
     let name = |what: &str| format!("{robots} idle robots, no budget: {what}");
-    let of = |way: fn(&WentBack) -> &back::Way, what: &str| {
+    let of = |way: fn(&WentBack) -> &back::RollbackTimes, what: &str| {
         let disk = waits_s(each(ways, |w| way(w).groups), syncs_ms);
         let (took, half) = (each(ways, |w| way(w).all_s), each(ways, |w| way(w).half_s));
         let disk = Some(("an fdatasync for each group commit", disk.as_slice()));

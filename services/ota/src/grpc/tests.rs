@@ -3,7 +3,7 @@
 use crate::OtaService;
 use crate::fixture::{SEEDS, files, first_root, release, service, targets};
 use midshift_bundle::digest::Digest;
-use midshift_bundle::ways::Way;
+use midshift_bundle::encoded_target::EncodedTarget;
 use midshift_core::identity::Caller;
 use midshift_core::limits;
 use midshift_core::reason::Code;
@@ -253,7 +253,7 @@ async fn a_server_without_keys_says_what_to_do() {
 async fn a_robot_is_told_of_the_patch_that_is_listed_for_it_and_another_of_the_whole_and_nothing_else_is_made() {
     let mut world = world().await;
     let [old, new, other] = [b"old".as_slice(), b"new", b"other"].map(Digest::of_content);
-    let named = |from| Way { to: new, from }.target();
+    let named = |from| EncodedTarget { to: new, from }.target();
     let patch = b"what the old one lacks".to_vec();
     let listed = [
         ("gait-1.component".to_owned(), b"old".to_vec()),

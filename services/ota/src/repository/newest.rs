@@ -2,11 +2,11 @@
 
 use super::cannot_sign::SetLost;
 use midshift_bundle::digest::Digest;
+use midshift_bundle::encoded_target::EncodedTarget;
 use midshift_bundle::freshness::{Edition, Stamp};
 use midshift_bundle::key_set::KeySet;
 use midshift_bundle::manifest::Manifest;
 use midshift_bundle::repository::FileTarget;
-use midshift_bundle::ways::Way;
 use midshift_core::identity::{Actor, TokenId};
 use midshift_core::time::Utc;
 use serde::{Deserialize, Serialize};
@@ -133,11 +133,11 @@ impl Newest {
     /// The shortest listed way to a file for a robot that has `bases`, the best first, and the one of them that it leads from.
     pub fn way(&self, to: Digest, bases: &[Digest]) -> Option<(Option<Digest>, &FileTarget)> {
         let mut ways = bases.iter().copied().map(Some).chain([None]);
-        ways.find_map(|from| Some((from, self.files.get(&Way { to, from }.target())?)))
+        ways.find_map(|from| Some((from, self.files.get(&EncodedTarget { to, from }.target())?)))
     }
     /// Bytes of all listed ways that are shorter than the files they lead to.
     pub fn way_bytes(&self) -> u64 {
-        let ways = self.files.iter().filter(|(name, _)| Way::of_target(name).is_some());
+        let ways = self.files.iter().filter(|(name, _)| EncodedTarget::of_target(name).is_some());
         ways.map(|(_, file)| file.length).sum()
     }
     /// Whether a signed release has this file.

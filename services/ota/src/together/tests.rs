@@ -11,8 +11,8 @@ use crate::{OtaReader, OtaService, Parts};
 use bytes::Bytes;
 use http::{Request as Get, StatusCode};
 use midshift_bundle::digest::Digest;
+use midshift_bundle::encoded_target::EncodedTarget;
 use midshift_bundle::repository::PEOPLE_LIFE_MS;
-use midshift_bundle::ways::Way;
 use midshift_core::time::{ScaledClock, Utc};
 use midshift_proto::ota::v1;
 use midshift_proto::ota::v1::chunk_service_server::ChunkService;
@@ -474,7 +474,7 @@ async fn a_gateway_tells_robots_of_the_patches_that_are_listed() {
     let site = Site::new();
     let one = site.process().await;
     let [base, target] = [b"old".as_slice(), b"new"].map(Digest::of_content);
-    let patch = (Way { to: target, from: Some(base) }.target(), b"what it lacks".to_vec());
+    let patch = (EncodedTarget { to: target, from: Some(base) }.target(), b"what it lacks".to_vec());
     let release = [("gait-2.component".to_owned(), b"new".to_vec()), patch.clone()];
     publish(&one, None, &release, 0).await.expect("published");
     let reader = site.reader().await;

@@ -9,10 +9,10 @@ use std::fs;
 use std::path::Path;
 
 /// Something that happens to a folder, and its name.
-type Way = (&'static str, fn(&Path));
+type Loss = (&'static str, fn(&Path));
 
 /// Each way in which a folder loses what it kept.
-const WAYS: [Way; 6] = [
+const LOSSES: [Loss; 6] = [
     ("the folder", |folder| fs::remove_dir_all(folder).unwrap()),
     ("the latch", |folder| fs::remove_file(folder.join("latch")).unwrap()),
     ("the key", |folder| fs::remove_file(folder.join("key.pem")).unwrap()),
@@ -41,7 +41,7 @@ async fn lost(server: &Server) -> Vec<v1::Stop> {
 
 #[tokio::test]
 async fn each_way_of_losing_the_memory_begins_with_the_fleet_stopped_until_that_stop_is_reset() {
-    for (way, lose) in WAYS {
+    for (way, lose) in LOSSES {
         let (folder, [stands, _]) = used().await;
         lose(&folder.path());
         let mut found = Vec::new();

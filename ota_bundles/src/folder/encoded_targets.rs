@@ -4,10 +4,10 @@
 //! worth it.
 
 use super::{Error, Folder, io};
+use crate::encoded_target::EncodedTarget;
 use crate::encoding::{Base, ENCODED_BYTES_MAX, ENCODED_BYTES_MIN, Encoded, encode};
 use crate::manifest::{Component, Manifest};
 use crate::repository::{FileTarget, listed};
-use crate::ways::Way;
 use midshift_core::reason::Refusal;
 use midshift_core::task::raw::parse_version;
 use std::collections::BTreeSet;
@@ -22,7 +22,7 @@ const WORTH_PERCENT: u64 = 95;
 
 impl Folder {
     /// Makes what robots will fetch instead of the files of `bundle`, and puts it beside them.
-    pub(super) fn make_ways(
+    pub(super) fn make_encoded_targets(
         &self,
         bundle: &Path,
         manifest: &Manifest,
@@ -39,7 +39,7 @@ impl Folder {
             }
             let file = bundle.join(component.target());
             let mut most = component.length / 100 * WORTH_PERCENT;
-            let whole = Way { to: component.digest, from: None };
+            let whole = EncodedTarget { to: component.digest, from: None };
             if let Some(listed) = known.iter().find(|file| file.name == whole.target()) {
                 most = most.min(listed.length - 1);
             } else if let Some(shorter) = self.make(whole, &file, component.length, None, most)? {
@@ -48,7 +48,7 @@ impl Folder {
                 made.push(shorter);
             }
             for base in bases(component, &releases) {
-                let way = Way { to: component.digest, from: Some(base.digest) };
+                let way = EncodedTarget { to: component.digest, from: Some(base.digest) };
                 let is_there =
                     names.contains(way.target().as_str()) || made.iter().any(|file| file.name == way.target());
                 if !is_there {
@@ -85,7 +85,7 @@ impl Folder {
 
     fn make(
         &self,
-        way: Way,
+        way: EncodedTarget,
         file: &Path,
         length: u64,
         base: Option<&Path>,

@@ -15,14 +15,14 @@ const PATCH: &str = ".patch";
 
 /// Where a shorter file leads.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Way {
+pub struct EncodedTarget {
     /// What comes out.
     pub to: Digest,
     /// What a robot must have; none: nothing.
     pub from: Option<Digest>,
 }
 
-impl Way {
+impl EncodedTarget {
     /// The name of its target.
     pub fn target(&self) -> String {
         match self.from {
@@ -44,7 +44,7 @@ impl Way {
 }
 
 /// Names of listed ways that lead to nothing once `gone` is listed no more.
-pub(crate) fn ways_to<'a>(gone: &BTreeSet<Digest>, known: &'a [FileTarget]) -> impl Iterator<Item = &'a str> {
+pub(crate) fn targets_of_gone<'a>(gone: &BTreeSet<Digest>, known: &'a [FileTarget]) -> impl Iterator<Item = &'a str> {
     let names = known.iter().map(|file| file.name.as_str());
-    names.filter(move |name| Way::of_target(name).is_some_and(|way| gone.contains(&way.to)))
+    names.filter(move |name| EncodedTarget::of_target(name).is_some_and(|way| gone.contains(&way.to)))
 }

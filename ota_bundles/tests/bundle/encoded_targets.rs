@@ -3,11 +3,11 @@
 use crate::shelf::START;
 use midshift_bundle::build::build;
 use midshift_bundle::digest::Digest;
+use midshift_bundle::encoded_target::EncodedTarget;
 use midshift_bundle::encoding::{Base, decode};
 use midshift_bundle::folder::{Error, Folder};
 use midshift_bundle::keys::SecretKey;
 use midshift_bundle::repository::{FileTarget, Profile, listed};
-use midshift_bundle::ways::Way;
 use std::fs;
 use std::io::Cursor;
 use std::path::PathBuf;
@@ -56,7 +56,7 @@ impl Shop {
     fn sign(&self, version: u64, from: &[&str]) -> Result<(), Error> {
         let from: Vec<String> = from.iter().map(|name| (*name).to_owned()).collect();
         let bundle = self.built(version, &program(version));
-        self.folder.add_with_ways(&bundle, &from, &[&self.key], START).map(drop)
+        self.folder.add_with_encoded_targets(&bundle, &from, &[&self.key], START).map(drop)
     }
     fn listed(&self) -> Vec<FileTarget> {
         let version = self.folder.targets_version().expect("readable").expect("signed");
@@ -67,9 +67,10 @@ impl Shop {
     fn ways(&self, to: u64) -> (Vec<u64>, bool) {
         let to = Digest::of_content(&program(to));
         let files = self.listed();
-        let has = |way: Way| files.iter().any(|file| file.name == way.target());
-        let bases = (0..9).filter(|from| has(Way { to, from: Some(Digest::of_content(&program(*from))) })).collect();
-        (bases, has(Way { to, from: None }))
+        let has = |way: EncodedTarget| files.iter().any(|file| file.name == way.target());
+        let bases =
+            (0..9).filter(|from| has(EncodedTarget { to, from: Some(Digest::of_content(&program(*from))) })).collect();
+        (bases, has(EncodedTarget { to, from: None }))
     }
 }
 
@@ -95,7 +96,7 @@ fn a_patch_leads_to_the_file_and_is_shorter_than_the_whole() {
     shop.sign(1, &[]).expect("signed");
     let [old, new] = [0, 1].map(program);
     let (files, to) = (shop.listed(), Digest::of_content(&new));
-    let listed = |from| files.iter().find(|file| file.name == Way { to, from }.target()).expect("listed");
+    let listed = |from| files.iter().find(|file| file.name == EncodedTarget { to, from }.target()).expect("listed");
     let (patch, whole) = (listed(Some(Digest::of_content(&old))), listed(None));
     assert!(patch.length < whole.length && whole.length < new.len() as u64);
     let bytes = fs::read(shop.folder.file(&patch.name, patch.digest)).expect("there");
@@ -109,12 +110,13 @@ fn what_does_not_become_shorter_has_no_ways() {
     let shop = Shop::new();
     let add = |version, content: &[u8]| {
         let bundle = shop.built(version, content);
-        shop.folder.add_with_ways(&bundle, &[], &[&shop.key], START).expect("signed");
+        shop.folder.add_with_encoded_targets(&bundle, &[], &[&shop.key], START).expect("signed");
     };
     add(0, &noise(7, 50_000));
     add(1, &noise(8, 50_000));
     add(2, b"so short that asking costs as much");
-    let ways: Vec<_> = shop.listed().into_iter().filter(|file| Way::of_target(&file.name).is_some()).collect();
+    let ways: Vec<_> =
+        shop.listed().into_iter().filter(|file| EncodedTarget::of_target(&file.name).is_some()).collect();
     assert!(ways.is_empty(), "{ways:?}");
     let left = fs::read_dir(shop.place.path().join("r/targets")).expect("there").count();
     assert_eq!(left, 6, "nothing lies around");
@@ -135,11 +137,11 @@ fn ways_go_with_the_file_that_they_lead_to() {
 #[test]
 fn only_two_digests_name_a_way() {
     let [to, from] = [b"to".as_slice(), b"from"].map(Digest::of_content);
-    for way in [Way { to, from: Some(from) }, Way { to, from: None }] {
-        assert_eq!(Way::of_target(&way.target()), Some(way));
+    for way in [EncodedTarget { to, from: Some(from) }, EncodedTarget { to, from: None }] {
+        assert_eq!(EncodedTarget::of_target(&way.target()), Some(way));
     }
     let (half, strange) = (format!("{to}.patch"), format!("{to}.x.patch"));
     for name in ["gait-1.0.0.component", "x.zst", "x.y.patch", ".zst", half.as_str(), strange.as_str()] {
-        assert_eq!(Way::of_target(name), None, "{name}");
+        assert_eq!(EncodedTarget::of_target(name), None, "{name}");
     }
 }

@@ -4,7 +4,7 @@ use crate::release::Releases;
 use crate::sets::{noise, patch, wanted};
 use midshift_agent::sets::memory::MemorySets;
 use midshift_agent::sets::{CHUNK_BYTES, FileRef, Sets};
-use midshift_agent::update::io::{UpdateWorker, Way, Worker};
+use midshift_agent::update::io::{DownloadPlan, UpdateWorker, Worker};
 use midshift_agent::update::{Done, Failure, Job};
 use midshift_bundle::digest::Digest;
 use std::sync::Arc;
@@ -33,11 +33,11 @@ impl Bench {
         Self { releases, sets, old, new, patch }
     }
     /// What the server says of ways to the new program.
-    fn says(&self, ways: Vec<Way>) {
+    fn says(&self, ways: Vec<DownloadPlan>) {
         self.releases.ways(&wanted(&self.new), ways);
     }
-    fn patched(&self) -> Way {
-        Way::Shorter { base: Some(Digest::of_content(&self.old)), encoded: wanted(&self.patch) }
+    fn patched(&self) -> DownloadPlan {
+        DownloadPlan::Shorter { base: Some(Digest::of_content(&self.old)), encoded: wanted(&self.patch) }
     }
     async fn fetch(&self) -> Done {
         let mut worker = UpdateWorker::new(Box::new(self.sets.clone()), Arc::new(self.releases.clone()));
@@ -86,7 +86,7 @@ async fn a_way_that_does_not_lead_there_is_left_for_good_and_the_file_comes_as_i
     for wrong in [&tampered, &other, &bomb] {
         let bench = Bench::new();
         let encoded = bench.releases.hold(wrong);
-        bench.says(vec![Way::Shorter { base: Some(Digest::of_content(&bench.old)), encoded }]);
+        bench.says(vec![DownloadPlan::Shorter { base: Some(Digest::of_content(&bench.old)), encoded }]);
         assert!(matches!(bench.fetch().await, Done::Ok));
         assert!(bench.has_new());
         assert_eq!(bench.releases.served(), (wrong.len() + bench.new.len()) as u64);
@@ -109,10 +109,10 @@ async fn an_answer_that_cannot_be_meant_is_not_followed() {
     let base = Some(Digest::of_content(&bench.old));
     let (new, patch) = (wanted(&bench.new), wanted(&bench.patch));
     let cases = [
-        Way::Shorter { base: Some(Digest::of_content(b"of nobody")), encoded: patch },
-        Way::Shorter { base, encoded: FileRef { length: new.length, ..patch } },
-        Way::Shorter { base, encoded: FileRef { length: 0, ..patch } },
-        Way::Shorter { base, encoded: FileRef { length: 100, ..new } },
+        DownloadPlan::Shorter { base: Some(Digest::of_content(b"of nobody")), encoded: patch },
+        DownloadPlan::Shorter { base, encoded: FileRef { length: new.length, ..patch } },
+        DownloadPlan::Shorter { base, encoded: FileRef { length: 0, ..patch } },
+        DownloadPlan::Shorter { base, encoded: FileRef { length: 100, ..new } },
     ];
     for way in cases {
         let bench = Bench::new();
