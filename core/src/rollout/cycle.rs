@@ -11,7 +11,7 @@ use super::phases::advance;
 use super::projection::rows::{OtaClock, OtaMark, Phase, Rollout};
 use super::projection::state::RolloutProjection;
 use super::robots::machine::Move;
-use super::robots::{due, moves};
+use super::robots::{drains, due, moves};
 use crate::fleet::Board;
 use crate::ids::{RobotId, RolloutId};
 use crate::reason::Code;
@@ -95,7 +95,7 @@ fn plan_all(
     for id in open {
         plan.decide(view, now, "ota", |tx| advance::advance_rollout(tx, board, &id));
     }
-    plan.decide(view, now, "ota", moves::forget_drains);
+    plan.decide(view, now, "ota", drains::forget_drains);
     false
 }
 

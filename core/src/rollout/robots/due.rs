@@ -4,9 +4,9 @@
 //! Invariants:
 //! 1. Permission is given only while fleet's record says that this drain holds the robot, the roll-out runs and nobody
 //!    has frozen the area.
-//! 2. A drain is released only for one of [`crate::maintenance::ReleasedBy`].
-//! 3. Robots out of work for a roll-out are counted in its row, in the item that takes one more.
+//! 2. Robots out of work for a roll-out are counted in its row, in the item that takes one more.
 
+use super::drains::{is_asked, is_permission_unused};
 use super::machine::Move;
 use crate::authority::Authority;
 use crate::fleet::Board;
@@ -21,7 +21,7 @@ use crate::rollout::judgement::failures::is_hard;
 use crate::rollout::judgement::{infrastructure, jams, verdict};
 use crate::rollout::members::{area_bundles, matching};
 use crate::rollout::projection::queue::{is_directive_old, is_late, is_newcomer, is_on, is_retried, waits_out};
-use crate::rollout::projection::rows::{GivenPermission, Pause, Phase, Rollout, RolloutRobot, Step};
+use crate::rollout::projection::rows::{Pause, Phase, Rollout, RolloutRobot, Step};
 use crate::rollout::projection::spec::AbortScope;
 use crate::rollout::projection::state::RolloutProjection;
 use crate::time::Now;
@@ -319,7 +319,10 @@ impl<'a> Situation<'a> {
             _ => {}
         }
         match &r.grant {
-            Some(given) => self.unused(given).or_else(|| self.lost()),
+            Some(given) => {
+                let is_unused = is_permission_unused(view, self.board, self.now, r, given, report);
+                is_unused.then_some(Move::NotUsed).or_else(|| self.lost())
+            }
             None if self.stands_still() || (!is_on(rollout, r) && !view.bugs.pause_is_forgotten()) => {
                 Some(Move::LeaveDrain)
             }
@@ -341,27 +344,6 @@ impl<'a> Situation<'a> {
         let held = r.drain_id.as_ref().is_some_and(|id| view.is_held(&r.robot_id, id));
         let heard = self.is_heard() && anchor(view, self.board, &r.robot_id).is_some();
         (held || view.bugs.any_drain_will_do()) && heard
-    }
-
-    /// A permission that was seen unused: past its life a heartbeat of the current session says so, and nothing it said
-    /// before is on its way.
-    fn unused(self, given: &GivenPermission) -> Option<Move> {
-        let Self { view, r, .. } = self;
-        let life_ms = given.authority.life_ms();
-        if view.bugs.time_releases_drain() {
-            let over = r.moments.granted_link.is_some_and(|at| self.now.wall.ms_since(at.wall_unix_ms) > life_ms);
-            return over.then_some(Move::NotUsed);
-        }
-        let live = self.board.get(&r.robot_id).filter(|live| view.is_settled(live))?;
-        let other_session = live.report.session_epoch != given.authority.session_epoch;
-        let beats = life_ms.div_ceil(limits::HEARTBEAT.as_ms()) + 1;
-        let past = other_session || live.report.hb > given.authority.hb + beats;
-        let said = live.report.update.as_ref();
-        // One that took it and was killed before its switch record was written is where it was, and does not take it
-        // again.
-        let not_used = said.is_some_and(|u| u.grant_id <= given.grant_id && u.state == UpdateState::Staged);
-        let is_staged = self.report.is_some_and(|report| report.state == UpdateState::Staged);
-        (past && not_used && is_staged).then_some(Move::NotUsed)
     }
 
     /// The robot is not heard, though most others are. It is taken back until the gate of its wave closes.
@@ -529,12 +511,6 @@ pub(super) fn area_ahead(
     let here = || board.get(&r.robot_id).and_then(|live| view.area_of(live));
     let seen = || view.software.get(r.robot_id.as_str()).and_then(|s| s.row.area.clone());
     if rollout.revert_of.is_some() { None } else { here().or_else(seen) }
-}
-
-/// Fleet was asked to take it out of work, and its drain has not begun.
-pub(super) fn is_asked(view: &RolloutProjection, r: &RolloutRobot) -> bool {
-    let waits = |id| view.drain(id).is_none_or(|drain| drain.state == DrainState::Waiting);
-    r.step == Step::Draining && r.drain_id.as_ref().is_some_and(waits)
 }
 
 /// The heartbeat of the newest session to which a permission is anchored; none: there is none.

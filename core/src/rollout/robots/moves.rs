@@ -1,17 +1,18 @@
-//! Writes what is due for a robot: its row, what it should run, drains asked for and released, permissions.
+//! Writes what is due for a robot: its row, what it should run, permissions; with [`super::drains`] its drains.
 //!
 //! Called with what [`super::due::find_move`] said; [`super::machine`] says where it leads. Invariants:
 //! 1. One move is one item.
 //! 2. A permission relies on fleet's record of the robot, on the rules of its area and on the roll-out's row, and
 //!    robots out of work are counted in that row.
 
-use super::due::{anchor, area_ahead, is_asked, wants};
+use super::drains::{ask_drain, is_asked, next_number, recount, release_drain, unpermitted};
+use super::due::{anchor, area_ahead, wants};
 use super::machine::{self, Move};
 use crate::fleet::Board;
-use crate::fleet::rows::{Drain, RobotAuthority};
+use crate::fleet::rows::RobotAuthority;
 use crate::ids::{DrainId, RobotId, RolloutId};
 use crate::limits;
-use crate::maintenance::{DrainRelease, DrainRequest, ReleasedBy};
+use crate::maintenance::ReleasedBy;
 use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason};
 use crate::robot::Duty;
@@ -24,7 +25,7 @@ use crate::rollout::members::matching::other_key;
 use crate::rollout::members::newcomers;
 use crate::rollout::projection::queue::{is_directive_old, is_retried};
 use crate::rollout::projection::rows::{
-    Act, GivenPermission, Lost, OtaClock, RobotSoftware, Rollout, RolloutRobot, Step, WayBack,
+    Act, GivenPermission, Lost, RobotSoftware, Rollout, RolloutRobot, Step, WayBack,
 };
 use crate::rollout::projection::state::RolloutProjection;
 use crate::rollout::projection::timestamp::Stamp;
@@ -199,11 +200,6 @@ fn must_be_ordered_back(view: &RolloutProjection, rollout: &Rollout, r: &Rollout
     left || r.way_back.unstuck || !view.desired.contains_key(r.robot_id.as_str())
 }
 
-/// Why a drain without a permission that may be alive may end.
-fn unpermitted(r: &RolloutRobot) -> ReleasedBy {
-    if r.not_used { ReleasedBy::NotUsed } else { ReleasedBy::NoGrant }
-}
-
 fn stamp_now(tx: &Tx) -> Stamp {
     Stamp::new(&tx.now, &tx.view.started)
 }
@@ -334,14 +330,6 @@ fn drop_bundle(tx: &mut Tx, r: &RolloutRobot) {
     }
 }
 
-/// Rising, and never used again also after the store was restored; above `used`, which somebody says was given before.
-fn next_number(tx: &mut Tx, used: u64) -> u64 {
-    let clock = tx.view.clocks.get("ota").map(|c| c.row).unwrap_or_default();
-    let number = (clock.number.max(used) + 1).max(tx.now.wall.0.max(0) as u64);
-    tx.put_row(OtaClock { number, ..clock }, "ota.numbered");
-    number
-}
-
 /// The highest permission that a robot says it has used. After a jump of the clock it may lie ahead of everything that
 /// a store of before knows; what lies further ahead than a clock jumps is not followed: so far the word of one robot
 /// moves the numbers of all.
@@ -351,39 +339,6 @@ fn used_grant(view: &RolloutProjection, board: &Board, now: &Now, robot_id: &Rob
     let used = said.into_iter().chain(known).map(|report| report.grant_id).max().unwrap_or_default();
     let most = (now.wall.0.max(0) as u64).saturating_add(limits::GRANT_AHEAD_MAX_MS);
     if used > most { 0 } else { used }
-}
-
-fn ask_drain(tx: &mut Tx, rollout: &Rollout, r: &mut RolloutRobot, urgent: bool) {
-    let Ok(drain_id) = DrainId::parse(&format!("ota:{}", next_number(tx, 0))) else { return };
-    let is_way_back = rollout.phase.goes_back();
-    let goal = if is_way_back || rollout.revert_of.is_some() { "goes back from" } else { "changes to" };
-    let label = tx.view.bundles.get(rollout.spec.bundle.as_str()).map(|b| b.row.label()).unwrap_or_default();
-    let request = DrainRequest {
-        drain_id: drain_id.clone(),
-        robot_id: r.robot_id.clone(),
-        rollout_id: r.rollout_id.clone(),
-        reason: format!("{goal} {label}"),
-        within_ms: rollout.spec.drain_within_ms,
-        urgent,
-        is_way_back,
-        forward: rollout.revert_of.is_none() && r.step == Step::Staged,
-        written_off: !r.counts(),
-    };
-    tx.put_row(request, "drain.requested");
-    r.drain_id = Some(drain_id);
-    (r.ready, r.grant, r.not_used) = (false, None, false);
-    if r.counts() {
-        count_in_flight(tx, &r.rollout_id, 1);
-    }
-}
-
-fn release_drain(tx: &mut Tx, r: &mut RolloutRobot, why: ReleasedBy) {
-    let Some(drain_id) = r.drain_id.take() else { return };
-    (r.ready, r.grant) = (false, None);
-    tx.put_row(DrainRelease { drain_id, why }, "drain.release");
-    if r.counts() {
-        count_in_flight(tx, &r.rollout_id, -1);
-    }
 }
 
 /// A person is told of a robot that is lost; the roll-out's policy may say the rest.
@@ -410,15 +365,6 @@ pub fn write_off(tx: &mut Tx, mut r: RolloutRobot, act: Act) {
     tx.put_row(r, "robot.written_off");
 }
 
-/// The drain of a robot counts for fleet and for the roll-out from now on, or does not.
-fn recount(tx: &mut Tx, r: &RolloutRobot, by: i32) {
-    let request = r.drain_id.as_ref().and_then(|id| tx.view.requests.get(id.as_str())).map(|q| q.row.clone());
-    if let Some(request) = request {
-        tx.put_row(DrainRequest { written_off: by < 0, ..request }, "drain.recounted");
-        count_in_flight(tx, &r.rollout_id, by);
-    }
-}
-
 /// Leaves a drain in which no permission may be alive.
 fn give_up_drain(tx: &mut Tx, mut r: RolloutRobot, to: Step) {
     if to == Step::Staged {
@@ -443,13 +389,6 @@ pub fn take_back_asked(tx: &mut Tx, rollout_id: &RolloutId) {
     }
 }
 
-/// One more or less is out of work for a roll-out: the row that two planners fight over.
-fn count_in_flight(tx: &mut Tx, rollout_id: &RolloutId, by: i32) {
-    let Some(rollout) = tx.view.rollout(rollout_id).cloned() else { return };
-    let in_flight = rollout.in_flight.saturating_add_signed(by);
-    tx.put_row(Rollout { in_flight, ..rollout }, "rollout.in_flight");
-}
-
 fn give_grant(tx: &mut Tx, board: &Board, rollout: &Rollout, mut r: RolloutRobot) {
     let (Some(drain_id), Some(authority)) = (r.drain_id.clone(), anchor(tx.view, board, &r.robot_id)) else { return };
     // Fleet's record must still say so when this is written.
@@ -466,15 +405,4 @@ fn give_grant(tx: &mut Tx, board: &Board, rollout: &Rollout, mut r: RolloutRobot
     r.moments.granted_link = Some(stamp_now(tx));
     r.attempted = true;
     tx.put_row(r, "robot.granted");
-}
-
-/// Takes requests away that fleet has nothing left to do for.
-pub fn forget_drains(tx: &mut Tx) {
-    let over = tx.view.releases.values().map(|r| r.row.drain_id.clone());
-    let over: Vec<DrainId> = over.filter(|id| tx.view.drain(id).is_none()).take(limits::ITEM_ROWS_MAX / 4).collect();
-    for drain_id in over {
-        tx.rely::<Drain>(drain_id.as_str());
-        tx.delete::<DrainRequest>(drain_id.as_str(), "drain.forgotten");
-        tx.delete::<DrainRelease>(drain_id.as_str(), "drain.forgotten");
-    }
 }
