@@ -84,7 +84,7 @@ pub fn absorb(view: &mut FleetProjection, now: Now, board: &Board, entries: &[En
                     mark(tx, entry.seq);
                 });
             }
-            (Log::Ota | Log::Stop, None, Some(body)) if &*entry.kind == crate::maintenance::INCIDENT => {
+            (Log::Ota | Log::Stop, None, Some(body)) if &*entry.kind == crate::drain_request::INCIDENT => {
                 match serde_json::from_str::<Reason>(body) {
                     Ok(reason) => {
                         let by = if entry.log == Log::Stop { "stop" } else { "ota" };

@@ -13,13 +13,13 @@
 //!    otherwise keep it on bad software.
 //! 7. What the area's rules keep in work by capability limits the drains of 6 too.
 
+use crate::drain_request::{DrainRelease, DrainRequest};
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::objects;
 use crate::fleet::projection::rows::{AreaBudget, Drain, DrainState, RobotHolder};
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{AreaId, RobotId};
-use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::policy::AreaPolicy;
 use crate::presence::Presence;
 use crate::reason::{Code, Reason};

@@ -5,6 +5,7 @@
 //! Called once a cycle, after [`super::budget`]. Invariant: a drain takes the robot's mutex only from none, and gives it back only from itself;
 //! it never cuts a grasp and never leaves a robot in a lane: it is held in a standing place that is its own. A drain whose deadline passes is refused and the robot works on.
 
+use crate::drain_request::{DrainRelease, DrainRequest};
 use crate::fleet::assignment::errands;
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::{self, Board};
@@ -15,7 +16,6 @@ use crate::fleet::tasks::{eligibility, errand_reports, load};
 use crate::fleet::traffic::routing;
 use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{DrainId, RobotId};
-use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::reason::{Code, Reason};
 use crate::site::{Kind, WaypointIx};
 use crate::step::StepKind;

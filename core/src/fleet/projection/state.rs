@@ -10,10 +10,10 @@ use super::rows::{
     RobotCounter, RobotHolder, ServiceClock, SiteRow, Timer,
 };
 use crate::desired_state::{DesiredPolicy, DesiredWork};
+use crate::drain_request::{DrainRelease, DrainRequest};
 use crate::fleet::bugs::Bugs;
 use crate::identity::RobotIdentity;
 use crate::ids::{AttemptId, RobotId, TaskId};
-use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::policy::AreaPolicy;
 use crate::projection::{Indexed, projection};
 use crate::reason::Reason;

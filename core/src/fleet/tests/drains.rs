@@ -1,10 +1,10 @@
 //! Robots that leave their work, many at once.
 
 use super::*;
+use crate::drain_request::{DrainRelease, DrainRequest, ReleasedBy};
 use crate::fleet::rows::DrainState;
 use crate::ids::{DrainId, RolloutId};
 use crate::limits;
-use crate::maintenance::{DrainRelease, DrainRequest, ReleasedBy};
 
 /// What the rollout service asks for at once.
 const DRAINS: usize = 1_000;

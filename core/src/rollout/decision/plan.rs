@@ -2,10 +2,10 @@
 //!
 //! Invariant: a decision that touches a row of a newer version is given up and leaves the projection as it was.
 
+use crate::drain_request::INCIDENT;
 use crate::identity::Actor;
 use crate::ids::RobotId;
 use crate::item::Item;
-use crate::maintenance::INCIDENT;
 use crate::reason::Reason;
 use crate::rollout::projection::state::RolloutProjection;
 use crate::time::Now;

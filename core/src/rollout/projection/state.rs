@@ -9,13 +9,13 @@
 use super::rows::{
     AreaBundle, Bundle, CommandKey, OtaClock, OtaMark, Quarantine, RobotSoftware, Rollout, RolloutRobot,
 };
+use crate::drain_request::{DrainRelease, DrainRequest};
 use crate::fleet::Board;
 use crate::fleet::liveness;
 use crate::fleet::rows::{AreaBudget, Drain, RobotAuthority, RobotControl, RobotCounter, RobotHolder};
 use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AreaId, DrainId, RobotId, RolloutId};
 use crate::limits;
-use crate::maintenance::{DrainRelease, DrainRequest};
 use crate::policy::AreaPolicy;
 use crate::presence::Presence;
 use crate::projection::{Indexed, projection};

@@ -4,11 +4,11 @@
 //! 1. A drain is released only for one of [`ReleasedBy`]. Time alone releases none.
 //! 2. Robots out of work for a roll-out are counted in its row, in the item that takes one more.
 
+use crate::drain_request::{DrainRelease, DrainRequest, ReleasedBy};
 use crate::fleet::Board;
 use crate::fleet::rows::{Drain, DrainState};
 use crate::ids::{DrainId, RolloutId};
 use crate::limits;
-use crate::maintenance::{DrainRelease, DrainRequest, ReleasedBy};
 use crate::rollout::decision::plan::Tx;
 use crate::rollout::projection::rows::{GivenPermission, OtaClock, Rollout, RolloutRobot, Step};
 use crate::rollout::projection::state::RolloutProjection;

@@ -8,11 +8,11 @@
 use super::drains::{ask_drain, is_asked, next_number, recount, release_drain, unpermitted};
 use super::due::{anchor, area_ahead, wants};
 use super::machine::{self, Move};
+use crate::drain_request::ReleasedBy;
 use crate::fleet::Board;
 use crate::fleet::rows::RobotAuthority;
 use crate::ids::{DrainId, RobotId, RolloutId};
 use crate::limits;
-use crate::maintenance::ReleasedBy;
 use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason};
 use crate::robot::Duty;

@@ -107,15 +107,15 @@ impl Rig {
 
     /// All release rows that were ever written, by why.
     pub(super) fn releases(&self) -> Vec<ReleasedBy> {
-        let table = crate::maintenance::DrainRelease::TABLE;
+        let table = crate::drain_request::DrainRelease::TABLE;
         let bodies = self.feed.iter().filter(|e| e.table == Some(table)).filter_map(|e| e.body.as_ref());
-        bodies.map(|b| serde_json::from_str::<crate::maintenance::DrainRelease>(b).expect("a row").why).collect()
+        bodies.map(|b| serde_json::from_str::<crate::drain_request::DrainRelease>(b).expect("a row").why).collect()
     }
 
     /// Codes of the incidents that were asked for.
     pub(super) fn incidents(&self) -> Vec<Code> {
         let told =
-            self.feed.iter().filter(|e| &*e.kind == crate::maintenance::INCIDENT).filter_map(|e| e.body.as_ref());
+            self.feed.iter().filter(|e| &*e.kind == crate::drain_request::INCIDENT).filter_map(|e| e.body.as_ref());
         told.map(|b| serde_json::from_str::<Reason>(b).expect("a reason").code).collect()
     }
 }

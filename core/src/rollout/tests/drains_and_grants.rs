@@ -198,7 +198,7 @@ fn robots_that_charge_are_asked_first_and_urgent_drains_do_not_wait() {
     rig.fleet_turn();
     let state = |rig: &Rig, n: usize| rig.fleet.drains[&format!("ota:{n}")].row.state;
     assert_eq!([0, 1, 2].map(|n| state(&rig, n)), [DrainState::Waiting, DrainState::Waiting, DrainState::Draining]);
-    rig.put_row(crate::maintenance::DrainRequest {
+    rig.put_row(crate::drain_request::DrainRequest {
         drain_id: DrainId::parse("ota:9").expect("an id"),
         ..request(0, true)
     });
@@ -226,9 +226,9 @@ fn whoever_goes_back_from_an_aborted_bundle_does_not_wait_for_robots_that_only_a
     let is_on = |rig: &Rig, n: usize| rig.fleet.drains[&format!("ota:{n}")].row.is_on();
     assert_eq!([0, 1].map(|n| is_on(&rig, n)), [false, false], "one may be out of work, and one is");
     for n in [3, 4] {
-        rig.put_row(crate::maintenance::DrainRequest { is_way_back: true, ..request(n, false) });
+        rig.put_row(crate::drain_request::DrainRequest { is_way_back: true, ..request(n, false) });
     }
-    rig.put_row(crate::maintenance::DrainRequest {
+    rig.put_row(crate::drain_request::DrainRequest {
         drain_id: DrainId::parse("ota:8").expect("an id"),
         is_way_back: true,
         ..request(0, false)
@@ -321,14 +321,14 @@ fn a_load_keeps_nobody_from_going_back_nor_from_a_person_who_asked_for_the_robot
     let mut plan = fleet::Plan::default();
     plan.decide(&mut rig.fleet, rig.now, "ana", |tx| drain::request_drain(tx, &robot_id(0), "oil", "ana", 60_000));
     rig.commit(plan.items);
-    rig.put_row(crate::maintenance::DrainRequest { is_way_back: true, ..request(1, false) });
+    rig.put_row(crate::drain_request::DrainRequest { is_way_back: true, ..request(1, false) });
     rig.ticks(3);
     let states: Vec<_> = rig.fleet.drains.values().map(|d| d.row.state).collect();
     assert_eq!(states, [DrainState::Held, DrainState::Held]);
 }
 
-fn request(n: usize, urgent: bool) -> crate::maintenance::DrainRequest {
-    crate::maintenance::DrainRequest {
+fn request(n: usize, urgent: bool) -> crate::drain_request::DrainRequest {
+    crate::drain_request::DrainRequest {
         drain_id: DrainId::parse(&format!("ota:{n}")).expect("an id"),
         robot_id: robot_id(n),
         rollout_id: rollout_id("ro"),
@@ -368,14 +368,14 @@ fn charge(id: &crate::ids::AttemptId, errand: crate::task::state::Errand) -> cra
 fn a_request_and_its_release_together_make_no_drain_and_both_go_when_none_stands() {
     let mut rig = Rig::new(2);
     rig.put_row(request(0, false));
-    rig.put_row(crate::maintenance::DrainRelease { drain_id: request(0, false).drain_id, why: ReleasedBy::NoGrant });
+    rig.put_row(crate::drain_request::DrainRelease { drain_id: request(0, false).drain_id, why: ReleasedBy::NoGrant });
     rig.fleet_turn();
     assert!(rig.fleet.drains.is_empty());
     rig.ota_turn();
     assert!(rig.ota.requests.is_empty() && rig.ota.releases.is_empty());
     rig.put_row(request(1, false));
     rig.fleet_turn();
-    rig.put_row(crate::maintenance::DrainRelease { drain_id: request(1, false).drain_id, why: ReleasedBy::NoGrant });
+    rig.put_row(crate::drain_request::DrainRelease { drain_id: request(1, false).drain_id, why: ReleasedBy::NoGrant });
     rig.ota_turn();
     assert_eq!(rig.ota.requests.len(), 1, "the drain stands");
     rig.fleet_turn();

@@ -57,7 +57,7 @@ fn a_roll_out_that_was_offered_to_nobody_is_incomplete_and_says_why() {
     }
     rig.until(60, |r| r.phase() == Phase::Completed);
     assert_eq!((rig.count(Step::Skipped), outcome(&rig, "ro")), (3, Some(Ending::Incomplete)));
-    let told = rig.feed.iter().rfind(|e| &*e.kind == crate::maintenance::INCIDENT).and_then(|e| e.body.as_ref());
+    let told = rig.feed.iter().rfind(|e| &*e.kind == crate::drain_request::INCIDENT).and_then(|e| e.body.as_ref());
     let told: Reason = serde_json::from_str(told.expect("a person is told")).expect("a reason");
     assert_eq!((told.code, told.metadata["offered"].as_str()), (Code::RolloutIncomplete, "0"));
     assert!(told.text().contains("pinned"), "{}", told.text());

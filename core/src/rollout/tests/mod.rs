@@ -29,6 +29,7 @@ mod trial_and_gates;
 mod waves_and_matching;
 mod ways_back;
 
+use crate::drain_request::ReleasedBy;
 use crate::fleet;
 use crate::fleet::Board;
 use crate::fleet::maintenance::{budget, drain};
@@ -38,7 +39,6 @@ use crate::fleet::rows::{
 use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AreaId, BundleId, DrainId, RobotId, RolloutId, WaypointId};
 use crate::item::{Expect, Item, Write};
-use crate::maintenance::ReleasedBy;
 use crate::policy::AreaPolicy;
 use crate::reason::{Code, Reason, Refusal};
 use crate::robot::{Fault, HardwareStop, Inventory, Lane, Load, ReportedState, Vitals};

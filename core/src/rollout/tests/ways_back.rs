@@ -42,7 +42,7 @@ fn section(rig: &Rig, n: usize) -> DesiredUpdate {
 
 /// Robots, reasons and roll-outs of the incidents that say that one could not go back.
 fn stuck(rig: &Rig) -> Vec<(String, Option<String>, Option<String>)> {
-    let told = rig.feed.iter().filter(|e| &*e.kind == crate::maintenance::INCIDENT);
+    let told = rig.feed.iter().filter(|e| &*e.kind == crate::drain_request::INCIDENT);
     let read = |e: &Entry| {
         let reason: Reason = serde_json::from_str(e.body.as_ref()?).expect("a reason");
         let fact = |key: &str| reason.metadata.get(key).cloned();

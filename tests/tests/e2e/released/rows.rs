@@ -11,7 +11,7 @@ use midshift_core::robot_events::InboxEntry;
 use midshift_core::rows::{Entry, Key, Log, Record, Revision, Row, Seq, Table};
 use midshift_core::session::{LaneMark, Session};
 use midshift_core::{
-    audit, desired_state, fleet, identity, leadership, maintenance, policy, presence, rollout, stop, task, update,
+    audit, desired_state, drain_request, fleet, identity, leadership, policy, presence, rollout, stop, task, update,
 };
 use midshift_proto::link::v1::LaneBatch;
 use midshift_proto::{parse, session};
@@ -70,7 +70,7 @@ fn hold_entry(found: &mut Found, entry: &Entry) -> anyhow::Result<()> {
         let key = Key::new(table, &*entry.subject);
         return hold(&Row { key, revision: Revision(1), index: entry.index.clone(), body: body.clone() });
     }
-    if &*entry.kind == maintenance::INCIDENT {
+    if &*entry.kind == drain_request::INCIDENT {
         return keeps(body, &serde_json::to_string(&serde_json::from_str::<Reason>(body)?)?);
     }
     if entry.log == Log::RobotInbox {
@@ -118,8 +118,8 @@ records! {
     Bundle rollout::rows::Bundle;
     Rollout rollout::rows::Rollout;
     RolloutRobot rollout::rows::RolloutRobot;
-    DrainRequest maintenance::DrainRequest;
-    DrainRelease maintenance::DrainRelease;
+    DrainRequest drain_request::DrainRequest;
+    DrainRelease drain_request::DrainRelease;
     DesiredUpdate update::DesiredUpdate;
     RobotSoftware rollout::rows::RobotSoftware;
     Quarantine rollout::rows::Quarantine;

@@ -1,4 +1,4 @@
-//! Rows that the rollout service alone writes, apart from drains ([`crate::maintenance`]): releases, roll-outs, robots
+//! Rows that the rollout service alone writes, apart from drains ([`crate::drain_request`]): releases, roll-outs, robots
 //! in them, what robots run and should run, what they must not run, and what the service keeps of itself.
 
 mod robot;

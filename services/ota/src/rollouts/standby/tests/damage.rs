@@ -1,7 +1,7 @@
 //! A file that changed on the disk, found by the process that does not lead.
 
 use super::*;
-use midshift_core::maintenance::INCIDENT;
+use midshift_core::drain_request::INCIDENT;
 use midshift_core::rows::{Entry, Seq};
 
 #[tokio::test(start_paused = true)]
