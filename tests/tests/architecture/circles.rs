@@ -1,5 +1,5 @@
-//! Files of a crate use each other one way: there is no circle of files, and the rooms of core's `fleet` and `rollout` and
-//! of the agent stand one above the other.
+//! Files of a crate use each other one way, and so do folders: there is no circle of files or of modules that stand beside
+//! each other, and the rooms of core's `fleet` and `rollout` and of the agent stand one above the other.
 //!
 //! Arrows are read from `use` and from paths in code. A method called on a value is no arrow here.
 
@@ -30,12 +30,29 @@ const AGENT: &[&str] = &[
 fn in_circles(arrows: &Arrows) -> BTreeSet<String> {
     let leads_back = |path: &&String| {
         let (mut open, mut seen) = (vec![*path], BTreeSet::new());
-        while let Some(next) = open.pop().and_then(|at| arrows.get(at)) {
-            open.extend(next.iter().filter(|at| seen.insert((*at).clone())));
+        while let Some(at) = open.pop() {
+            open.extend(arrows.get(at).into_iter().flatten().filter(|at| seen.insert((*at).clone())));
         }
         seen.contains(*path)
     };
     arrows.keys().filter(leads_back).cloned().collect()
+}
+
+/// Arrows between modules that stand beside each other, each with all that is below it: a file and its folder are one.
+fn between_modules(arrows: &Arrows) -> Arrows {
+    let names = |path: &str| -> Vec<String> {
+        let names = path.trim_end_matches(".rs").split('/');
+        names.filter(|name| !matches!(*name, "mod" | "lib" | "main")).map(str::to_owned).collect()
+    };
+    let mut between = Arrows::new();
+    for (from, to) in arrows.iter().flat_map(|(from, to)| to.iter().map(move |to| (names(from), names(to)))) {
+        let shared = from.iter().zip(&to).take_while(|(from, to)| from == to).count();
+        // What uses the module around it, or is used by it, stands not beside it.
+        if let (Some(from), Some(to)) = (from.get(..=shared), to.get(..=shared)) {
+            between.entry(from.join("/")).or_default().insert(to.join("/"));
+        }
+    }
+    between
 }
 
 /// Arrows that lead up, where `rooms` are folders and files of `below` from the lowest to the highest.
@@ -57,7 +74,7 @@ fn upwards(arrows: &Arrows, below: &str, rooms: &[&str]) -> Vec<(String, String)
 }
 
 #[test]
-fn no_file_comes_into_a_circle() {
+fn no_file_and_no_folder_comes_into_a_circle() {
     let suites = ["e2e", "simulation", "model"].map(|suite| (suite.to_owned(), format!("tests/tests/{suite}")));
     let mut seen = 0;
     let mut found = BTreeSet::new();
@@ -65,6 +82,7 @@ fn no_file_comes_into_a_circle() {
         let arrows = Sources::of_folder(&library, &folder).arrows(|_| true);
         seen += arrows.values().map(BTreeSet::len).sum::<usize>();
         found.extend(in_circles(&arrows));
+        found.extend(in_circles(&between_modules(&arrows)));
     }
     assert!(seen > 2_000, "the arrows are not read: {seen}");
     assert_eq!(found, BTreeSet::new(), "they came into a circle");
@@ -121,6 +139,32 @@ fn a_circle_is_found_however_its_arrows_are_written() {
     ] {
         let found = in_circles_of(&[lib, door, ("src/a/x.rs", "use super::y;"), ("src/a/y.rs", back)]);
         assert_eq!(found.contains("src/a/x.rs"), is_circle, "{back}");
+    }
+}
+
+#[test]
+fn a_circle_of_folders_is_found_though_no_file_leads_back_to_itself() {
+    let small = |verbs: &str| {
+        let texts = [
+            ("src/lib.rs", "mod out;\nmod robot;\nmod rollout;"),
+            ("src/out.rs", ""),
+            ("src/robot.rs", verbs),
+            ("src/robot/target.rs", "pub fn find() {}"),
+            ("src/rollout/mod.rs", "pub mod target;\nuse super::robot::find as find_robot;\nuse crate::out::*;"),
+            ("src/rollout/target.rs", "pub fn find() {}"),
+        ];
+        let texts = texts.map(|(path, text)| (path.to_owned(), text.to_owned()));
+        Sources::new("small", "src", texts).arrows(|_| true)
+    };
+    let door = "mod target;\npub use target::find;";
+    for (verbs, is_circle) in
+        [(format!("{door}\nfn f() {{ crate::rollout::target::find() }}"), true), (door.into(), false)]
+    {
+        let arrows = small(&verbs);
+        assert_eq!(in_circles(&arrows), BTreeSet::new(), "who passes a name on does not own it");
+        let both = ["src/robot", "src/rollout"].map(str::to_owned);
+        let found = in_circles(&between_modules(&arrows));
+        assert_eq!(found, if is_circle { both.into() } else { BTreeSet::new() }, "{verbs}");
     }
 }
 
