@@ -1,4 +1,4 @@
-//! Shorter ways for a file over a network: zstd, and zstd against another file that the robot has (a patch).
+//! Encodings that make a file shorter on a network: zstd, and zstd against another file that the robot has (a patch).
 //!
 //! A file is cut into segments of [`SEGMENT_BYTES`]; each is one zstd frame with its length and check. In a patch a segment may point into
 //! the other file, [`REACH_BYTES`] before and after its own place: bytes that moved farther come again. So nobody holds more than

@@ -229,7 +229,7 @@ impl Folder {
         self.add_and(bundle, keys, now, |_, _| Ok(Vec::new()))
     }
 
-    /// As [`Folder::add`], with shorter ways to its files: alone, from the newest releases of the same bundle, and from those that `from` names as
+    /// As [`Folder::add`], with encoded targets of its files: alone, from the newest releases of the same bundle, and from those that `from` names as
     /// NAME-VERSION.
     ///
     /// # Errors
@@ -270,11 +270,11 @@ impl Folder {
         let expires = now.plus_ms(PEOPLE_LIFE_MS);
         // What may not be listed is refused before anything is made of it.
         sign_targets(previous.as_deref(), &files, &[], expires, &[])?;
-        let ways = beside(&manifest, previous.as_deref())?;
+        let encoded_targets = beside(&manifest, previous.as_deref())?;
         for file in &files {
             copy(&bundle.join(&file.name), &self.file(&file.name, file.digest))?;
         }
-        files.extend(ways);
+        files.extend(encoded_targets);
         Ok((manifest, self.store_signed(&sign_targets(previous.as_deref(), &files, &[], expires, keys)?)?))
     }
 

@@ -3,7 +3,7 @@
 //! Modules:
 //! 1. `build` makes a bundle of a draft; `manifest` lists its components.
 //! 2. `keys`, `repository` and `directive` sign. `key_set` names keys that sign directives; `roots` changes root keys.
-//! 3. `folder` stores the repository of release people. `encoding` compresses files and makes patches, which `ways` names.
+//! 3. `folder` stores the repository of release people. `encoding` compresses files and makes patches, which `encoded_target` names.
 //! 4. `freshness` checks documents on the server. `trust` verifies them on a robot; `release` keeps the verified ones.
 //!
 //! Invariant: nothing here runs, installs or downloads anything.

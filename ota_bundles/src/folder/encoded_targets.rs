@@ -1,6 +1,7 @@
-//! Shorter ways to the files of a new release, made before it is signed: alone, and from the releases that robots are likely to have.
+//! Makes the encoded targets of a new release before it is signed: compressed files, and patches from the releases that
+//! robots are likely to have.
 //!
-//! Invariant: a way that is listed is never made again, since another release of this program may make other bytes of it; one is kept only if it is
+//! Invariant: one that is listed is never made again, since another release of this program may make other bytes of it; one is kept only if it is
 //! worth it.
 
 use super::{Error, Folder, io};
@@ -17,7 +18,7 @@ use std::path::Path;
 
 /// Releases of a bundle, the newest by version, from which robots are expected to come.
 const RELEASES_BEFORE: usize = 3;
-/// A way is worth it up to this share of the file, percent: above it asking costs more than it saves.
+/// An encoded target is worth it up to this share of the file, percent: above it asking costs more than it saves.
 const WORTH_PERCENT: u64 = 95;
 
 impl Folder {
@@ -48,12 +49,12 @@ impl Folder {
                 made.push(shorter);
             }
             for base in bases(component, &releases) {
-                let way = EncodedTarget { to: component.digest, from: Some(base.digest) };
+                let patch = EncodedTarget { to: component.digest, from: Some(base.digest) };
                 let is_there =
-                    names.contains(way.target().as_str()) || made.iter().any(|file| file.name == way.target());
+                    names.contains(patch.target().as_str()) || made.iter().any(|file| file.name == patch.target());
                 if !is_there {
                     let base = self.file(&base.target(), base.digest);
-                    made.extend(self.make(way, &file, component.length, Some(&base), most)?);
+                    made.extend(self.make(patch, &file, component.length, Some(&base), most)?);
                 }
             }
         }
@@ -85,7 +86,7 @@ impl Folder {
 
     fn make(
         &self,
-        way: EncodedTarget,
+        target: EncodedTarget,
         file: &Path,
         length: u64,
         base: Option<&Path>,
@@ -104,7 +105,7 @@ impl Folder {
             fs::remove_file(&beside).map_err(io("removing", &beside))?;
             return Ok(None);
         };
-        let name = way.target();
+        let name = target.target();
         let path = self.file(&name, digest);
         midshift_durable::rename(&beside, &path).map_err(io("naming", &path))?;
         Ok(Some(FileTarget { name, digest, length }))

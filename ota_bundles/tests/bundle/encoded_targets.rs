@@ -1,4 +1,4 @@
-//! Shorter ways to files of a release: who signs makes them, from which releases, and only what is worth it.
+//! Encoded targets of a release: who signs makes them, from which releases, and only what is worth it.
 
 use crate::shelf::START;
 use midshift_bundle::build::build;

@@ -1,6 +1,6 @@
 //! The client's workflow of the TUF specification, step by step: <https://theupdateframework.github.io/specification/latest/#detailed-client-workflow>.
 //! Each test has the number of the steps that it walks. 5.1, the fixed time of a refresh, is the clock that each is given; 5.7, files, is walked by
-//! agents and in `ways`. There are no delegations (5.6.7).
+//! agents and in `encoded_targets`. There are no delegations (5.6.7).
 
 use crate::metadata::rule;
 use crate::shelf::{Documents, START, Seeds, Shelf, key, signers, target};

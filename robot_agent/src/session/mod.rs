@@ -101,7 +101,7 @@ type Replaying = (u64, Replayed);
 /// The worker comes back from each job.
 type Worked = (Box<dyn Worker>, Done);
 
-/// On the way to a session.
+/// How far the agent is with its next session.
 enum ConnectState {
     /// Nothing under way.
     Idle,

@@ -87,7 +87,7 @@ impl NoLine {
     }
 }
 
-/// On the way to a line.
+/// How far the agent is with its next line.
 enum DialState {
     Idle,
     Waiting(Pin<Box<tokio::time::Sleep>>),

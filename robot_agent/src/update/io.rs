@@ -37,9 +37,9 @@ pub type Pieces = std::pin::Pin<Box<dyn tokio_stream::Stream<Item = io::Result<V
 pub trait Remote: fmt::Debug + Send + Sync {
     /// The metadata document of this name; none: there is none.
     async fn metadata(&self, name: &str) -> io::Result<Option<Vec<u8>>>;
-    /// A range of content, or of a shorter way to it. `NotFound`: there is none.
+    /// A range of content, or of an encoding of it. `NotFound`: there is none.
     async fn range(&self, digest: &Digest, range: Range<u64>) -> io::Result<Pieces>;
-    /// How content is best fetched by a robot that has `bases`. A repository without shorter ways says: as it is.
+    /// How content is best fetched by a robot that has `bases`. A repository without encodings says: as it is.
     async fn plan_download(&self, _wanted: &FileRef, _bases: &[Digest]) -> io::Result<DownloadPlan> {
         Ok(DownloadPlan::AsItIs)
     }
@@ -59,7 +59,7 @@ pub enum DownloadPlan {
     },
 }
 
-/// Whether a file of so many bytes may come by a shorter way; others come as they are.
+/// Whether a file of so many bytes may come encoded; others come as they are.
 pub(crate) fn may_come_encoded(length: u64) -> bool {
     (ENCODED_BYTES_MIN..=ENCODED_BYTES_MAX).contains(&length)
 }

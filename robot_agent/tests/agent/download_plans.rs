@@ -1,4 +1,4 @@
-//! Shorter ways to a file: taken when they lead there, left for good when they do not.
+//! Encoded downloads of a file: taken when they lead there, left for good when they do not.
 
 use crate::release::Releases;
 use crate::sets::{noise, patch, wanted};

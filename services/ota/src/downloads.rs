@@ -137,7 +137,7 @@ impl Downloads {
         let file = self.listed(digest).await?;
         let mut answer = v1::GetEncodingResponse { encoding: v1::Encoding::Identity.into(), ..Default::default() };
         if let Some(newest) = shown.documents.newest()
-            && let Some((from, shorter)) = newest.way(file.digest, &bases)
+            && let Some((from, shorter)) = newest.find_encoded(file.digest, &bases)
         {
             let kind = if from.is_some() { v1::Encoding::ZstdPatch } else { v1::Encoding::Zstd };
             answer.encoding = kind.into();

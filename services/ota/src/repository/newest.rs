@@ -130,15 +130,15 @@ impl Newest {
     pub(super) fn lists_sets(&self) -> bool {
         self.files.keys().any(|name| KeySet::number_of(name).is_some())
     }
-    /// The shortest listed way to a file for a robot that has `bases`, the best first, and the one of them that it leads from.
-    pub fn way(&self, to: Digest, bases: &[Digest]) -> Option<(Option<Digest>, &FileTarget)> {
-        let mut ways = bases.iter().copied().map(Some).chain([None]);
-        ways.find_map(|from| Some((from, self.files.get(&EncodedTarget { to, from }.target())?)))
+    /// The shortest listed encoded target of a file for a robot that has `bases`, the best first, and the one of them that it leads from.
+    pub fn find_encoded(&self, to: Digest, bases: &[Digest]) -> Option<(Option<Digest>, &FileTarget)> {
+        let mut froms = bases.iter().copied().map(Some).chain([None]);
+        froms.find_map(|from| Some((from, self.files.get(&EncodedTarget { to, from }.target())?)))
     }
-    /// Bytes of all listed ways that are shorter than the files they lead to.
-    pub fn way_bytes(&self) -> u64 {
-        let ways = self.files.iter().filter(|(name, _)| EncodedTarget::of_target(name).is_some());
-        ways.map(|(_, file)| file.length).sum()
+    /// Bytes of all listed encoded targets.
+    pub fn encoded_bytes(&self) -> u64 {
+        let encoded = self.files.iter().filter(|(name, _)| EncodedTarget::of_target(name).is_some());
+        encoded.map(|(_, file)| file.length).sum()
     }
     /// Whether a signed release has this file.
     pub fn lists(&self, digest: Digest) -> bool {
