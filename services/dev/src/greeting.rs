@@ -23,10 +23,11 @@ pub fn greeting(args: &Dev, site: &Site, address: SocketAddr, stops: SocketAddr,
     } else {
         (stations.next().unwrap_or_default(), stations.next().unwrap_or_default())
     };
-    let clock = if args.speedup == 1.0 {
-        String::new()
-    } else {
-        format!(", site clock x{} (task times run ahead of the wall)", args.speedup)
+    let clock = match args.scenario {
+        _ if args.speedup == 1.0 => String::new(),
+        // The clock of a story is the wall's.
+        Some(_) => format!(", bodies x{}", args.speedup),
+        None => format!(", site clock x{} (task times run ahead of the wall)", args.speedup),
     };
     format!(
         "midshift dev  {} simulated robots, site \"{}\", {kept}{clock}\n\
@@ -78,6 +79,20 @@ mod tests {
         ] {
             assert!(lines.iter().any(|line| line.ends_with(command)), "{text}");
         }
+        Ok(())
+    }
+
+    #[test]
+    fn the_greeting_says_what_of_a_run_is_faster_than_real() -> anyhow::Result<()> {
+        let site = site_file::load(None, None, None)?.site;
+        let first = |line: &[&str]| -> anyhow::Result<String> {
+            let (args, made) = (Line::parse_from(line).dev, (PathBuf::new(), PathBuf::new()));
+            let text = greeting(&args, &site, "127.0.0.1:7420".parse()?, "127.0.0.1:7421".parse()?, made);
+            Ok(text.lines().next().unwrap_or_default().to_owned())
+        };
+        assert!(first(&["dev", "--speedup", "10"])?.ends_with(", site clock x10 (task times run ahead of the wall)"));
+        let story = ["dev", "--speedup", "10", "--scenario", "update-midshift"];
+        assert!(first(&story)?.ends_with(", bodies x10"), "its clock is the wall's");
         Ok(())
     }
 }
