@@ -108,7 +108,7 @@ impl Directive {
     ///
     /// # Errors
     /// The first reason not to take it.
-    pub fn open(envelope: &[u8], expected: &Expected) -> Result<Self, Rejection> {
+    pub fn verify(envelope: &[u8], expected: &Expected) -> Result<Self, Rejection> {
         let most = if expected.bugs.length_is_forgotten() { usize::MAX } else { ENVELOPE_BYTES_MAX };
         let opened = dsse::open(envelope, most, PAYLOAD_TYPE)?;
         let signer = opened

@@ -32,11 +32,11 @@ pub enum Error {
 }
 
 impl Release {
-    /// Of documents that have just been believed.
+    /// Of documents and a manifest, once all hold together.
     ///
     /// # Errors
     /// If they are no release.
-    pub fn new(root: &str, targets: &str, manifest: &[u8]) -> Result<Self, Error> {
+    pub fn verified(root: &str, targets: &str, manifest: &[u8]) -> Result<Self, Error> {
         let manifest = String::from_utf8_lossy(manifest).into_owned();
         let release = Self { root: root.to_owned(), targets: targets.to_owned(), manifest };
         release.check().map(|_| release)

@@ -279,7 +279,7 @@ fn metafile(bytes: &[u8], version: NonZeroU64) -> Result<Metafile, Error> {
     serde_json::from_value(meta).map_err(|source| Error::Read { role: "snapshot", source })
 }
 
-/// Whether `document` is signed as `root` asks, for people who put signatures together.
+/// Whether `document` is signed as `root` asks: for people who put signatures together, and for robots that check what runs.
 ///
 /// # Errors
 /// What is missing, or that one of the two cannot be read.

@@ -325,7 +325,7 @@ impl Trusted {
     /// # Errors
     /// Why nothing new is believed.
     pub async fn refresh(&self, source: Arc<dyn Source>, clock: Reading) -> Result<Refreshed, Error> {
-        self.refresh_or_root(source, clock).await.map_err(|failed| failed.error)
+        self.verify_repository(source, clock).await.map_err(|failed| failed.error)
     }
 
     /// As [`Self::refresh`], for whoever writes a new root down also when the rest fails: step 5.3.8 of the specification. Else keys that the
@@ -333,7 +333,7 @@ impl Trusted {
     ///
     /// # Errors
     /// Why nothing else is believed, with the new root.
-    pub async fn refresh_or_root(&self, source: Arc<dyn Source>, clock: Reading) -> Result<Refreshed, Unrefreshed> {
+    pub async fn verify_repository(&self, source: Arc<dyn Source>, clock: Reading) -> Result<Refreshed, Unrefreshed> {
         let heard = Arc::new(Mutex::new(Heard::new()));
         let asked = self.load_verified(source, clock, heard.clone()).await;
         asked.map_err(|error| {

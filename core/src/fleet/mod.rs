@@ -134,7 +134,7 @@ pub fn cycle(view: &mut FleetProjection, now: Now, board: &Board, pace: Pace, pl
         stops::plan(view, board, now, plan);
     }
     plan.slice.renew();
-    drain::apply_requests(view, now, plan);
+    drain::obey_requests(view, now, plan);
     plan.slice.renew();
     budget::plan(view, board, now, plan);
     plan.slice.renew();

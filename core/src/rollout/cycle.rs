@@ -81,7 +81,7 @@ fn plan_all(
     for id in due_robots(view) {
         let Some(row) = view.robots.get(&id).map(|r| &r.row) else { continue };
         let Some(rollout) = view.rollout(&row.rollout_id) else { continue };
-        let due = due::find_move(view, board, &now, rollout, row);
+        let due = due::decide_move(view, board, &now, rollout, row);
         let is_withheld =
             |due: &Move| moves::is_signed(view, rollout, row, due) && moves::why_unsigned(view, row).is_some();
         if let Some(due) = due.filter(|due| !is_withheld(due)) {

@@ -100,7 +100,7 @@ fn waits_for(
     let mut since = r.since;
     let mut deadline = None;
     if let Some(by) = moves::why_unsigned(view, r)
-        && let Some(due) = due::find_move(view, board, now, rollout, r)
+        && let Some(due) = due::decide_move(view, board, now, rollout, r)
         && moves::is_signed(view, rollout, r, &due)
     {
         return Some(Blocked { by, since, deadline });

@@ -34,7 +34,7 @@ fn open(envelope: &[u8], generation: u64, now: Utc) -> Result<Directive, Rejecti
 pub fn open_naively(envelope: &[u8], generation: u64, now: Utc, bugs: Bugs) -> Result<Directive, Rejection> {
     let keys: BTreeMap<KeyId, PublicKey> = [key(7).public()].into_iter().map(|k| (k.id(), k)).collect();
     let robot_id = robot("rbt-01");
-    Directive::open(envelope, &Expected { robot_id: &robot_id, keys: &keys, generation, now, bugs })
+    Directive::verify(envelope, &Expected { robot_id: &robot_id, keys: &keys, generation, now, bugs })
 }
 
 #[test]

@@ -30,7 +30,7 @@ async fn what_was_believed_holds_when_it_has_expired_and_others_sign() {
     shelf.release(&files(&walk()));
     let robot = shelf.shown_to(&shelf.robot()).await.expect("is believed");
     let (root, targets) = robot.trusted.documents().expect("it was asked");
-    let release = Release::new(root, targets, &walk().to_bytes()).expect("a release");
+    let release = Release::verified(root, targets, &walk().to_bytes()).expect("a release");
     let read: Release = serde_json::from_str(&serde_json::to_string(&release).expect("writes")).expect("reads");
     shelf.rotate(Seeds { root: 5, targets: 6, snapshot: 7, timestamp: 8 });
     assert_eq!(read.check().expect("holds"), walk());
@@ -42,7 +42,7 @@ fn what_is_not_listed_or_not_signed_or_was_changed_does_not_hold() {
     let mut shelf = Shelf::new();
     let (manifest, bytes) = (walk(), walk().to_bytes());
     let root = String::from_utf8(shelf.first_root.clone()).expect("text");
-    let made = |targets: &[u8], bytes: &[u8]| Release::new(&root, &String::from_utf8_lossy(targets), bytes);
+    let made = |targets: &[u8], bytes: &[u8]| Release::verified(&root, &String::from_utf8_lossy(targets), bytes);
     shelf.release(&files(&manifest)[..1]);
     assert!(matches!(made(&shelf.targets, &bytes), Err(Error::Unlisted(name)) if name == "gait-2.0.0.component"));
     shelf.release(&files(&manifest)[1..]);

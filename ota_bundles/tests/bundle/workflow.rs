@@ -126,7 +126,7 @@ async fn steps_5_3_3_to_5_3_5_the_next_root_is_signed_by_both_and_has_the_next_n
 
 /// What a robot writes down of a refresh that fails.
 async fn rooted(shelf: &Shelf, robot: &Trusted) -> Option<Trusted> {
-    let failed = robot.refresh_or_root(Arc::new(shelf.documents.clone()), shelf.clock()).await.expect_err("fails");
+    let failed = robot.verify_repository(Arc::new(shelf.documents.clone()), shelf.clock()).await.expect_err("fails");
     failed.rooted.map(|rooted| *rooted)
 }
 

@@ -181,7 +181,7 @@ impl UpdateWorker {
     }
 
     async fn refresh(&self, trusted: &Trusted, clock: Reading, keys_after: u64) -> Done {
-        let failed = match trusted.refresh_or_root(Arc::new(Metadata(self.remote.clone())), clock).await {
+        let failed = match trusted.verify_repository(Arc::new(Metadata(self.remote.clone())), clock).await {
             Ok(refreshed) => match self.key_sets(&refreshed, keys_after).await {
                 Ok(key_sets) => return Done::Refreshed { refreshed: Box::new(refreshed), key_sets },
                 Err(error) => {

@@ -134,7 +134,7 @@ fn proven() -> Proven {
     let bundle = releases.release("2.0.0");
     let documents = releases.documents();
     let text = |name: &str| String::from_utf8_lossy(&documents[name]).into_owned();
-    let release = Release::new(&text("1.root.json"), &text("2.targets.json"), &bundle.manifest.to_bytes());
+    let release = Release::verified(&text("1.root.json"), &text("2.targets.json"), &bundle.manifest.to_bytes());
     let set = set("v2", b"program", b"settings");
     let mut proven = Proven { directive_generation: 3, ..Proven::default() };
     proven.committed.previous = Some("v1".to_owned());

@@ -1,4 +1,4 @@
-//! Decides ONLINE, SUSPECT and OFFLINE from heartbeats alone, and writes what changed.
+//! Writes whom heartbeats make ONLINE, SUSPECT or OFFLINE, as [`midshift_core::presence`] decides it.
 //!
 //! Invariant: nobody's clock but ours takes part; a store that fails costs one period. Of several gateways the one that had the robot's
 //! newest session writes at once, the others a little later if it has not.

@@ -49,8 +49,12 @@ const LOGGED: &[(&str, &str, &str)] = &[
     ("robot_agent/src/core/stops.rs", "level", "one of four words"),
     ("robot_agent/src/core/stops.rs", "stops", "ids"),
     ("robot_agent/src/core/stops.rs", "awaiting_resume", "ids"),
-    ("robot_agent/src/core/update/beliefs.rs", "rejection", "one of a closed list of sentences about signed documents"),
-    ("robot_agent/src/core/update/beliefs.rs", "keys", "digests"),
+    (
+        "robot_agent/src/core/update/directive_check.rs",
+        "rejection",
+        "one of a closed list of sentences about signed documents",
+    ),
+    ("robot_agent/src/core/update/directive_check.rs", "keys", "digests"),
     ("robot_agent/src/core/update/integrity.rs", "sets", "digests"),
     (
         "robot_agent/src/core/update/integrity.rs",

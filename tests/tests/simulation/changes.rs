@@ -158,7 +158,7 @@ impl Changes {
         let keys = self.keys.clone();
         let expected =
             Expected { robot_id: &row.robot_id, keys: &keys, generation: 0, now: Utc(0), bugs: Bugs::default() };
-        let opened = Directive::open(row.directive.as_bytes(), &expected);
+        let opened = Directive::verify(row.directive.as_bytes(), &expected);
         let robot = self.robot(&row.robot_id);
         if let Ok(directive) = opened
             && let Ok(rollout) = RolloutId::parse(&directive.rollout)

@@ -145,7 +145,7 @@ impl Rows {
                 robot.step
             );
             let expected = Expected { robot_id: id, keys: &keys, generation: 0, now, bugs: Bugs::default() };
-            let said = Directive::open(desired.directive.as_bytes(), &expected)?;
+            let said = Directive::verify(desired.directive.as_bytes(), &expected)?;
             ensure!(said.generation == desired.generation, "{id} has a directive of another generation");
             let at = crate::ota::hearers::index(id.as_str()).context("a robot of another name")?;
             let (heard, times) = (hearers.ask(&format!("generation {at}"))?, hearers.ask(&format!("count {at}"))?);

@@ -57,11 +57,11 @@ pub fn request_drain(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str,
 pub fn undrain(tx: &mut Tx, robot_id: &RobotId) {
     let asked: Vec<DrainId> =
         tx.view.all_drains_of(robot_id).filter(|d| d.is_of_person()).map(|d| d.drain_id.clone()).collect();
-    asked.iter().for_each(|drain_id| give_back(tx, robot_id, drain_id));
+    asked.iter().for_each(|drain_id| end_drain(tx, robot_id, drain_id));
 }
 
 /// Ends a drain, and what it holds is free.
-fn give_back(tx: &mut Tx, robot_id: &RobotId, drain_id: &DrainId) {
+fn end_drain(tx: &mut Tx, robot_id: &RobotId, drain_id: &DrainId) {
     let held = tx.view.authority.get(robot_id.as_str()).map(|a| a.row.holder.clone());
     if held == Some(RobotHolder::Maintenance(drain_id.clone())) {
         tx.put_row(RobotAuthority { robot_id: robot_id.clone(), holder: RobotHolder::None }, "robot.freed");
@@ -71,7 +71,7 @@ fn give_back(tx: &mut Tx, robot_id: &RobotId, drain_id: &DrainId) {
 
 /// Takes what the rollout service asks for and what it lets go. Both rows are relied upon: it takes a request away only while there is
 /// no drain, and a drain is made only while the request stands alone.
-pub fn apply_requests(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
+pub fn obey_requests(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     let released: Vec<(RobotId, DrainId)> = (view.drain_releases.keys())
         .filter_map(|id| view.drains.get(id))
         .map(|d| (d.row.robot_id.clone(), d.row.drain_id.clone()))
@@ -82,7 +82,7 @@ pub fn apply_requests(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
         }
         plan.decide(view, now, "ota", |tx| {
             tx.rely::<DrainRelease>(drain_id.as_str());
-            give_back(tx, &robot_id, &drain_id);
+            end_drain(tx, &robot_id, &drain_id);
         });
     }
     let is_new = |id: &&String| !view.drains.contains_key(*id) && !view.drain_releases.contains_key(*id);

@@ -1,6 +1,6 @@
 //! Finds what is due for each robot of a roll-out: fetch, drain, permission, trial, commit, and back.
 //!
-//! [`find_move`] says what is due and [`super::moves`] writes it, so that the planner and an explanation see the same.
+//! [`decide_move`] says what is due and [`super::moves`] writes it, so that the planner and an explanation see the same.
 //! Invariants:
 //! 1. Permission is given only while fleet's record says that this drain holds the robot, the roll-out runs and nobody
 //!    has frozen the area.
@@ -40,7 +40,7 @@ struct Situation<'a> {
 }
 
 /// What is due for `r` now, if anything.
-pub fn find_move(
+pub fn decide_move(
     view: &RolloutProjection,
     board: &Board,
     now: &Now,

@@ -1,6 +1,6 @@
 //! Writes what is due for a robot: its row, what it should run, permissions; with [`super::drains`] its drains.
 //!
-//! Called with what [`super::due::find_move`] said; [`super::machine`] says where it leads. Invariants:
+//! Called with what [`super::due::decide_move`] said; [`super::machine`] says where it leads. Invariants:
 //! 1. One move is one item.
 //! 2. A permission relies on fleet's record of the robot, on the rules of its area and on the roll-out's row, and
 //!    robots out of work are counted in that row.

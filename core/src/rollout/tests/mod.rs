@@ -445,7 +445,7 @@ impl Rig {
             let row = crate::projection::row_of(entry, table);
             self.fleet.absorb(&key, entry.revision, row.as_ref()).expect("a row");
         }
-        drain::apply_requests(&mut self.fleet, self.now, &mut plan);
+        drain::obey_requests(&mut self.fleet, self.now, &mut plan);
         budget::plan(&mut self.fleet, &self.board, self.now, &mut plan);
         drain::plan(&mut self.fleet, &self.board, self.now, &mut plan);
         plan.items
@@ -503,7 +503,7 @@ impl Rig {
             let counted = self.ota.robots_of(&rollout.rollout_id).filter(|r| r.drain_id.is_some() && r.counts());
             assert_eq!(rollout.in_flight as usize, counted.count(), "in flight");
             for r in self.ota.robots_of(&rollout.rollout_id) {
-                let due = due::find_move(&self.ota, &self.board, &self.now, rollout, r);
+                let due = due::decide_move(&self.ota, &self.board, &self.now, rollout, r);
                 let is_in_table = due.as_ref().is_none_or(|due| machine::next(r.step, due).is_some());
                 assert!(is_in_table, "{due:?} at {:?}", r.step);
                 let waits = crate::rollout::explain::blocked(&self.ota, &self.board, &self.now, rollout, r);

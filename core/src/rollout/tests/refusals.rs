@@ -90,7 +90,7 @@ fn nobody_is_tried_again_while_the_roll_out_stands_still() {
     let rollout = Rollout { second_pass: true, ..rig.rollout("ro") };
     let refused = Some(Code::MetadataRefused.into());
     let r = RolloutRobot { step: Step::Skipped, why: refused, ..rig.robot_in("ro", rig.order()[1]) };
-    let due = |rollout: &Rollout| due::find_move(&rig.ota, &rig.board, &rig.now, rollout, &r);
+    let due = |rollout: &Rollout| due::decide_move(&rig.ota, &rig.board, &rig.now, rollout, &r);
     assert_eq!(due(&rollout), Some(Move::Again));
     let held = Rollout { pauses: BTreeSet::from([Pause::Content]), ..rollout };
     assert_eq!(due(&held), None, "its refusal would be forgotten, and the roll-out go on");

@@ -34,7 +34,7 @@ fn reported(rig: &Rig, r: &RolloutRobot, state: Option<UpdateState>) -> Board {
 
 /// What is due in short; each such move stands in the table.
 fn name_of_move(rig: &Rig, board: &Board, rollout: &Rollout, r: &RolloutRobot) -> String {
-    let Some(due) = due::find_move(&rig.ota, board, &rig.now, rollout, r) else { return "-".to_owned() };
+    let Some(due) = due::decide_move(&rig.ota, board, &rig.now, rollout, r) else { return "-".to_owned() };
     assert!(machine::next(r.step, &due).is_some(), "{due:?} at {:?}", r.step);
     format!("{due:?}").split(['(', ' ', '{']).next().unwrap_or_default().to_owned()
 }

@@ -79,7 +79,7 @@ impl AgentCore {
         let refused = |why: String| Reason::new(Code::MetadataRefused, why);
         let listed = self.update.listed.as_ref();
         let (root, targets) = listed.and_then(|l| l.trusted.documents()).ok_or_else(|| refused(String::new()))?;
-        let release = Release::new(root, targets, manifest).map_err(|error| refused(error.to_string()))?;
+        let release = Release::verified(root, targets, manifest).map_err(|error| refused(error.to_string()))?;
         let mut proven = self.proven();
         proven.releases.insert(release.bundle(), Arc::new(release));
         proven.sets.insert(set.id(), set.clone());

@@ -3,7 +3,7 @@
 //! Invariant: only a directive of its own leads back, newer than any that was taken, and about the bundle that is
 //! committed.
 
-use super::beliefs::refusal_of;
+use super::directive_check::refusal_of;
 use crate::core::state::AgentCore;
 use crate::sets::Holdings;
 use crate::storage::Update;
@@ -35,7 +35,7 @@ impl AgentCore {
                 return false;
             }
         };
-        let opened = self.opened(&desired, software.directive_generation, trusted.now(self.reading(now)));
+        let opened = self.verify_directive(&desired, software.directive_generation, trusted.now(self.reading(now)));
         if opened == Err(Rejection::NotSigned) && self.update.keys_asked.as_ref() != Some(&desired.directive) {
             // The server may sign with a key that came since.
             self.ask_to_refresh(now, trusted, self.reading(now));

@@ -55,7 +55,7 @@ mod tests {
         let keys = BTreeMap::from([(key.public().id(), key.public())]);
         let bugs = Bugs::default();
         let expected = Expected { robot_id: &robot_id, keys: &keys, generation: 0, now: Utc(2_000), bugs };
-        let read = Directive::open(envelope.as_bytes(), &expected).expect("it is signed");
+        let read = Directive::verify(envelope.as_bytes(), &expected).expect("it is signed");
         assert_eq!(read.rollback_floor, 3);
     }
 }

@@ -163,7 +163,7 @@ impl AgentCore {
             self.update.judged = Some(desired.directive);
             return;
         }
-        match self.open(&desired, time) {
+        match self.accept_directive(&desired, time) {
             Ok(_) if self.goes_back_first(&desired) => {}
             Ok(directive) => {
                 self.update.judged = Some(desired.directive.clone());
@@ -206,10 +206,10 @@ impl AgentCore {
         true
     }
 
-    fn open(&self, desired: &DesiredUpdate, now: Utc) -> Result<Directive, Reason> {
+    fn accept_directive(&self, desired: &DesiredUpdate, now: Utc) -> Result<Directive, Reason> {
         let bugs = self.config.bugs;
         let newest = if bugs.replays_are_taken() { 0 } else { self.memory.ledger.software.directive_generation };
-        let directive = self.opened(desired, newest, now).map_err(|rejection| refusal_of(&rejection))?;
+        let directive = self.verify_directive(desired, newest, now).map_err(|rejection| refusal_of(&rejection))?;
         if self.lists(&directive.manifest, directive.manifest_length) || bugs.unlisted_is_fine() {
             Ok(directive)
         } else {
@@ -217,11 +217,16 @@ impl AgentCore {
         }
     }
 
-    pub(super) fn opened(&self, desired: &DesiredUpdate, generation: u64, now: Utc) -> Result<Directive, Rejection> {
+    pub(super) fn verify_directive(
+        &self,
+        desired: &DesiredUpdate,
+        generation: u64,
+        now: Utc,
+    ) -> Result<Directive, Rejection> {
         let keys = &self.directive_keys().keys;
         let (robot_id, bugs) = (&self.config.robot_id, Bugs::default());
         let expected = Expected { robot_id, keys, generation, now, bugs };
-        Directive::open(desired.directive.as_bytes(), &expected)
+        Directive::verify(desired.directive.as_bytes(), &expected)
     }
 
     /// Whether the envelope is the one that was taken last: after a restart it comes again. What was taken does not
@@ -232,7 +237,7 @@ impl AgentCore {
             return true;
         }
         let newest = software.directive_generation;
-        newest > 0 && self.opened(desired, newest - 1, Utc(0)).is_ok_and(|d| d.generation == newest)
+        newest > 0 && self.verify_directive(desired, newest - 1, Utc(0)).is_ok_and(|d| d.generation == newest)
     }
 
     pub(super) fn lists(&self, digest: &Digest, length: u64) -> bool {
