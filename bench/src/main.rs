@@ -22,7 +22,10 @@ mod saturation;
 mod session_baseline;
 mod stop;
 mod submit;
+mod swarm;
+mod task;
 mod unary_baseline;
+mod usage;
 mod watch;
 
 use clap::{Parser, Subcommand};
@@ -36,6 +39,8 @@ enum Name {
     Plan(plan::PlanArgs),
     /// Durable submits, many at once.
     Submit(submit::SubmitArgs),
+    /// What a task costs the server from its submit until a robot has done it.
+    Task(task::TaskArgs),
     /// From a submit to the offer at an idle robot.
     Offer(offer::OfferArgs),
     /// Many robots on the link once a second, and few at the knee.
@@ -74,6 +79,7 @@ fn main() -> anyhow::Result<()> {
     let figures = match args.name {
         Name::Plan(args) => wait(plan::run(args, &note))?,
         Name::Submit(args) => wait(submit::run(args, &note))?,
+        Name::Task(args) => wait(task::run(args, &note))?,
         Name::Offer(args) => wait(offer::run(args, &note))?,
         Name::Link(args) => wait(link::run(args, &note))?,
         Name::Gates(args) => gates::run(args)?,

@@ -65,7 +65,7 @@ pub enum Role {
     /// Robots that hear what software they should have, and fetch none.
     Hearers(crate::ota::hearers::HearersArgs),
     /// Real agents with simulated bodies that take software.
-    Swarm(crate::ota::swarm::SwarmArgs),
+    Swarm(crate::swarm::SwarmArgs),
     /// Robots that send as fast as they may.
     Flood {
         #[arg(long)]
@@ -163,7 +163,7 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
         }
         Role::Swarm(args) => {
             answer_questions(address, stop.clone(), |_| 0)?;
-            crate::ota::swarm::run(args, stop).await
+            crate::swarm::run(args, stop).await
         }
         Role::Flood { server, robots, unacknowledged } => {
             let acked = Arc::new(AtomicU64::new(0));

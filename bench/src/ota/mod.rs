@@ -16,7 +16,6 @@ mod programs;
 mod release;
 mod resume;
 mod server;
-pub mod swarm;
 
 pub use args::OtaArgs;
 

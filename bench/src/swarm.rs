@@ -1,4 +1,4 @@
-//! Real agents with simulated bodies that take software: what `sim run` starts, and what each needs to change its set.
+//! Real agents with simulated bodies: what `sim run` starts, and what each needs to change its set.
 
 use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_core::time::Clock;
@@ -21,20 +21,25 @@ pub struct SwarmArgs {
     /// How many.
     #[arg(long)]
     pub robots: usize,
-    /// Whose software they take.
+    /// How many times as fast as real ones they work.
+    #[arg(long, default_value_t = 1.0)]
+    pub pace: f64,
+    /// Whose software they take; without it none.
     #[arg(long)]
-    pub trust: PathBuf,
+    pub trust: Option<PathBuf>,
 }
 
 /// Runs all of them until `stop`: nothing goes wrong by itself, and no battery empties.
 pub async fn run(args: SwarmArgs, stop: CancellationToken) -> anyhow::Result<()> {
     let site = midshift_cli::site_file::load(Some(&args.site), None, None)?.site;
     let clock: Arc<dyn Clock> = midshift_process::clock::clock(1000);
-    let config = FleetConfig { faults: FaultRates::none(), drains: false, ..FleetConfig::new(site, args.robots, SEED) };
+    let mut config = FleetConfig::new(site, args.robots, SEED);
+    (config.faults, config.drains) = (FaultRates::none(), false);
+    config.pace_permille = (args.pace * 1000.0) as u32;
     let hall = Arc::new(Fleet::open(&config, &clock.now())?);
     let uri = midshift_cli::endpoint::uri(&args.server);
     let mut swarm = SwarmConfig::tcp(hall, clock, &uri, SEED);
-    swarm.software = Some(TrustAnchors::read(&args.trust)?);
+    swarm.software = args.trust.as_deref().map(TrustAnchors::read).transpose()?;
     Swarm::new(swarm).run(stop).await?;
     Ok(())
 }

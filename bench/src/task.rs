@@ -1,0 +1,192 @@
+//! What a task costs the server from its submit until it is done by a simulated robot: CPU, context switches, bytes and commits, less what
+//! the same robots cost in the same run while they have nothing to do.
+//!
+//! The server has a core of its own; the robots, who work many times as fast as real ones, and whoever submits share the others. CPU of
+//! PostgreSQL's own processes is told for itself.
+
+use crate::child::{Child, SESSIONS};
+use crate::engine::{Bed, Engine, EngineArgs};
+use crate::figure::Figure;
+use crate::submit::transports;
+use crate::usage::Usage;
+use anyhow::{Context, ensure};
+use midshift_core::site::{DEMO, text};
+use midshift_proto::task::v1::SubmitTaskRequest;
+use midshift_proto::task::v1::task_service_client::TaskServiceClient;
+use std::time::Duration;
+use tokio::time::{Instant, MissedTickBehavior, interval, sleep};
+use tonic::transport::Channel;
+
+/// All robots are attached by then.
+const ATTACH_WITHIN: Duration = Duration::from_secs(60);
+/// How often a server is asked how many tasks it has, with work and without.
+const LOOK_EVERY: Duration = Duration::from_secs(1);
+/// Different transports that are submitted over and over.
+const TRANSPORTS: usize = 1_000;
+/// Open tasks of each robot above which nothing is submitted: robots that are too slow for the rate make no backlog.
+const OPEN_PER_ROBOT: u64 = 4;
+const ADMITTED: &str = "midshift_task_admitted_total";
+const OPEN: &str = "midshift_fleet_tasks_open";
+
+/// What to measure.
+#[derive(Clone, Debug, clap::Args)]
+pub struct TaskArgs {
+    /// Simulated robots on the demo site, at most 20.
+    #[arg(long, default_value_t = 20)]
+    robots: usize,
+    /// Tasks a second.
+    #[arg(long, default_value_t = 20)]
+    rate: u64,
+    /// How many times as fast as real ones the robots work.
+    #[arg(long, default_value_t = 100.0)]
+    pace: f64,
+    /// Seconds measured of each round, first idle, then at work.
+    #[arg(long, default_value_t = 30)]
+    seconds: u64,
+    /// Seconds before each of the two that are not measured.
+    #[arg(long, default_value_t = 10)]
+    settle_seconds: u64,
+    /// Rounds on each engine.
+    #[arg(long, default_value_t = 5)]
+    rounds: usize,
+    #[command(flatten)]
+    engine: EngineArgs,
+}
+
+/// One round.
+struct Measured {
+    /// Each second without work, and with it.
+    idle: Usage,
+    busy: Usage,
+    /// Done each second.
+    tasks: f64,
+    /// The database's own processes, seconds of CPU each second, without work and with it.
+    database: Option<(f64, f64)>,
+}
+
+/// Runs rounds on each engine, in turn.
+pub async fn run(args: TaskArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> {
+    let engines = args.engine.engines(say);
+    let requests = transports(&text::parse(DEMO)?, TRANSPORTS)?;
+    let mut measured: Vec<Vec<Measured>> = engines.iter().map(|_| Vec::new()).collect();
+    for round in 1..=args.rounds {
+        for (engine, rounds) in engines.iter().zip(&mut measured) {
+            let one = measure(&args, engine, &requests).await?;
+            let each_ms = (one.busy.cpu_s - one.idle.cpu_s) * 1e3 / one.tasks;
+            say(&format!("round {round}{}: {:.1} tasks a second, {each_ms:.2} ms each", engine.suffix(), one.tasks));
+            rounds.push(one);
+        }
+    }
+    Ok(engines.iter().zip(&measured).flat_map(|(engine, rounds)| figures(&args, engine, rounds)).collect())
+}
+
+async fn measure(args: &TaskArgs, engine: &Engine, requests: &[SubmitTaskRequest]) -> anyhow::Result<Measured> {
+    let bed = engine.bed(args.engine.dir.as_ref())?;
+    let mut server = bed.serve(None, Some(0)).await?;
+    let robots = start_robots(args, &bed, &server)?;
+    let end = Instant::now() + ATTACH_WITHIN;
+    while (server.ask(SESSIONS)? as usize) < args.robots {
+        ensure!(Instant::now() < end, "{} of {} robots are attached", server.ask(SESSIONS)?, args.robots);
+        sleep(LOOK_EVERY).await;
+    }
+    let (idle, _, database_idle) = spend(args, engine, &mut server, None).await?;
+    let work = Submitter { client: TaskServiceClient::new(server.channel().await?), requests, submitted: 0 };
+    let (busy, tasks, database_busy) = spend(args, engine, &mut server, Some(work)).await?;
+    ensure!(tasks > 0.0, "no task was done");
+    drop((robots, server));
+    Ok(Measured { idle, busy, tasks, database: database_idle.zip(database_busy) })
+}
+
+fn start_robots(args: &TaskArgs, bed: &Bed<'_>, server: &Child) -> anyhow::Result<Child> {
+    let site = bed.path().join("demo.site.toml");
+    std::fs::write(&site, DEMO)?;
+    let site = site.to_str().context("a path that is no text")?;
+    let (address, robots, pace) = (server.address.to_string(), args.robots.to_string(), args.pace.to_string());
+    let role = ["swarm", "--server", &address, "--site", site, "--robots", &robots, "--pace", &pace];
+    Child::start(&role, Some(1))
+}
+
+/// What the server spends each second, what it has done each second, and the database's CPU, after a while to settle.
+async fn spend(
+    args: &TaskArgs,
+    engine: &Engine,
+    server: &mut Child,
+    mut work: Option<Submitter<'_>>,
+) -> anyhow::Result<(Usage, f64, Option<f64>)> {
+    pass(args, args.settle_seconds, server, &mut work).await?;
+    let (before, done, database_s) = (Usage::of(server)?, done(server)?, engine.cpu_s()?);
+    let begun = Instant::now();
+    pass(args, args.seconds, server, &mut work).await?;
+    let seconds = begun.elapsed().as_secs_f64();
+    let spent = Usage::of(server)?.a_second_since(before, seconds);
+    let database = engine.cpu_s()?.zip(database_s).map(|(after_s, before_s)| (after_s - before_s) / seconds);
+    Ok((spent, (self::done(server)? - done) as f64 / seconds, database))
+}
+
+/// Lets some seconds go by, with or without work.
+async fn pass(
+    args: &TaskArgs,
+    seconds: u64,
+    server: &mut Child,
+    work: &mut Option<Submitter<'_>>,
+) -> anyhow::Result<()> {
+    let end = Instant::now() + Duration::from_secs(seconds);
+    let mut due = interval(Duration::from_secs(1) / u32::try_from(args.rate.max(1))?);
+    due.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut look = interval(LOOK_EVERY);
+    let mut is_full = false;
+    while Instant::now() < end {
+        tokio::select! {
+            _ = look.tick() => is_full = server.ask(OPEN)? > OPEN_PER_ROBOT * args.robots as u64,
+            _ = due.tick() => if let Some(work) = work && !is_full { work.submit().await? },
+        }
+    }
+    Ok(())
+}
+
+/// Tasks that are over.
+fn done(server: &mut Child) -> anyhow::Result<u64> {
+    Ok(server.ask(ADMITTED)?.saturating_sub(server.ask(OPEN)?))
+}
+
+/// Submits one transport after the other.
+struct Submitter<'r> {
+    client: TaskServiceClient<Channel>,
+    requests: &'r [SubmitTaskRequest],
+    submitted: usize,
+}
+
+impl Submitter<'_> {
+    async fn submit(&mut self) -> anyhow::Result<()> {
+        let mut request = self.requests[self.submitted % self.requests.len()].clone();
+        request.request_id = format!("bench-{:08}", self.submitted);
+        self.submitted += 1;
+        self.client.submit_task(request).await?;
+        Ok(())
+    }
+}
+
+fn figures(args: &TaskArgs, engine: &Engine, rounds: &[Measured]) -> Vec<Figure> {
+    let load = format!("{} robots, pace {}", args.robots, args.pace);
+    let name = |what: &str| format!("a task, {what}, {load}{}", engine.suffix());
+    let each = |of: fn(&Usage) -> f64, scale: f64| -> Vec<f64> {
+        rounds.iter().map(|r| (of(&r.busy) - of(&r.idle)) * scale / r.tasks).collect()
+    };
+    let a_second = |of: fn(&Measured) -> f64| rounds.iter().map(of).collect::<Vec<_>>();
+    let mut figures = vec![
+        Figure::new("P5", name("done each second"), "1/s", &a_second(|r| r.tasks), None),
+        Figure::new("P5", name("server CPU each, less idle"), "ms", &each(|u| u.cpu_s, 1e3), None),
+        Figure::new("P5", name("the same robots idle"), "ms/s", &a_second(|r| r.idle.cpu_s * 1e3), None),
+        Figure::new("P5", name("context switches each"), "", &each(|u| u.switches, 1.0), None),
+        Figure::new("P5", name("commits each"), "", &each(|u| u.groups, 1.0), None),
+        Figure::new("P5", name("written each"), "KB", &each(|u| u.written_bytes, 1e-3), None),
+    ];
+    let database: Vec<f64> = rounds
+        .iter()
+        .filter_map(|round| round.database.map(|(idle, busy)| (busy - idle) * 1e3 / round.tasks))
+        .collect();
+    if !database.is_empty() {
+        figures.push(Figure::new("P5", name("CPU of the database each"), "ms", &database, None));
+    }
+    figures
+}
