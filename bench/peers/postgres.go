@@ -1,6 +1,7 @@
 package main
 
 import (
+	"cmp"
 	"context"
 	"errors"
 	"fmt"
@@ -42,14 +43,18 @@ func startDatabase(ctx context.Context, folder string) (*Database, error) {
 	if err != nil || len(programs) == 0 {
 		return nil, fmt.Errorf("no server programs of PostgreSQL: install the package postgresql")
 	}
-	slices.Sort(programs)
+	version := func(path string) float64 {
+		number, _ := strconv.ParseFloat(filepath.Base(filepath.Dir(path)), 64)
+		return number
+	}
+	slices.SortFunc(programs, func(a, b string) int { return cmp.Compare(version(a), version(b)) })
 	bin, data := programs[len(programs)-1], filepath.Join(folder, "data")
 	as := func(program string, args ...string) *exec.Cmd {
 		program = filepath.Join(bin, program)
 		if os.Getuid() != 0 {
-			return exec.CommandContext(ctx, program, args...)
+			return exec.Command(program, args...)
 		}
-		return exec.CommandContext(ctx, "runuser", append([]string{"-u", "postgres", "--", program}, args...)...)
+		return exec.Command("runuser", append([]string{"-u", "postgres", "--", program}, args...)...)
 	}
 	if err := giveTo("postgres", folder); err != nil {
 		return nil, err
@@ -59,10 +64,11 @@ func startDatabase(ctx context.Context, folder string) (*Database, error) {
 	}
 	started := as("pg_ctl", "-D", data, "-w", "-l", filepath.Join(folder, "log"), "-o",
 		"-c listen_addresses='' -c max_connections=200 -k "+folder, "start")
-	if out, err := started.CombinedOutput(); err != nil {
-		return nil, fmt.Errorf("pg_ctl start: %w: %s", err, out)
-	}
+	// Whatever becomes of the run, and of the start.
 	database := &Database{command: as("pg_ctl", "-D", data, "-m", "immediate", "stop")}
+	if out, err := started.CombinedOutput(); err != nil {
+		return database, fmt.Errorf("pg_ctl start: %w: %s", err, out)
+	}
 	config, err := pgxpool.ParseConfig(fmt.Sprintf("host=%s user=postgres dbname=postgres", folder))
 	if err != nil {
 		return database, err
@@ -213,7 +219,9 @@ func work(ctx context.Context, database *Database, args Args, cpu func() (float6
 	select {
 	case <-all:
 	case <-time.After(time.Minute):
+		lock.Lock()
 		failed = fmt.Errorf("%d of %d tasks were claimed", len(claimed), tasks)
+		lock.Unlock()
 	case <-ctx.Done():
 	}
 	after, err := cpu()

@@ -64,7 +64,7 @@ pub enum Role {
     },
     /// Robots that hear what software they should have, and fetch none.
     Hearers(crate::ota::hearers::HearersArgs),
-    /// Real agents with simulated bodies that take software.
+    /// Real agents with simulated bodies, who take software if they know whose.
     Swarm(crate::swarm::SwarmArgs),
     /// Robots that send as fast as they may.
     Flood {

@@ -21,7 +21,7 @@ pub struct SwarmArgs {
     /// How many.
     #[arg(long)]
     pub robots: usize,
-    /// How many times as fast as real ones they work.
+    /// How many times as fast as real ones they drive.
     #[arg(long, default_value_t = 1.0)]
     pub pace: f64,
     /// Whose software they take; without it none.

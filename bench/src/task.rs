@@ -1,14 +1,14 @@
-//! What a task costs the server from its submit until it is done by a simulated robot: CPU, context switches, bytes and commits, less what
-//! the same robots cost in the same run while they have nothing to do.
+//! What a task costs the server from its submit until it is over: CPU, context switches, bytes and commits, less what the same robots,
+//! which are simulated, cost in the same run before while they had nothing to do. So what grows with a store counts as cost of tasks.
 //!
-//! The server has a core of its own; the robots, who work many times as fast as real ones, and whoever submits share the others. CPU of
-//! PostgreSQL's own processes is told for itself.
+//! The server and the robots have a core each; whoever submits, and PostgreSQL, run on all. Its CPU is told for itself. Robots drive many
+//! times as fast as real ones; their hands keep real time, so that a transport takes eight seconds at least.
 
 use crate::child::{Child, SESSIONS};
 use crate::engine::{Bed, Engine, EngineArgs};
 use crate::figure::Figure;
 use crate::submit::transports;
-use crate::usage::Usage;
+use crate::usage::{Rates, Usage};
 use anyhow::{Context, ensure};
 use midshift_core::site::{DEMO, text};
 use midshift_proto::task::v1::SubmitTaskRequest;
@@ -23,8 +23,8 @@ const ATTACH_WITHIN: Duration = Duration::from_secs(60);
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// Different transports that are submitted over and over.
 const TRANSPORTS: usize = 1_000;
-/// Open tasks of each robot above which nothing is submitted: robots that are too slow for the rate make no backlog.
-const OPEN_PER_ROBOT: u64 = 4;
+/// Open tasks of each robot above which the robots are too slow for the rate: what is measured would be a backlog.
+const OPEN_PER_ROBOT: u64 = 2;
 const ADMITTED: &str = "midshift_task_admitted_total";
 const OPEN: &str = "midshift_fleet_tasks_open";
 
@@ -35,16 +35,16 @@ pub struct TaskArgs {
     #[arg(long, default_value_t = 20)]
     robots: usize,
     /// Tasks a second.
-    #[arg(long, default_value_t = 20)]
+    #[arg(long, default_value_t = 1)]
     rate: u64,
-    /// How many times as fast as real ones the robots work.
-    #[arg(long, default_value_t = 100.0)]
+    /// How many times as fast as real ones the robots drive.
+    #[arg(long, default_value_t = 50.0)]
     pace: f64,
-    /// Seconds measured of each round, first idle, then at work.
-    #[arg(long, default_value_t = 30)]
+    /// Seconds measured of each round, first idle, then at work. CPU is counted in hundredths of a second.
+    #[arg(long, default_value_t = 60)]
     seconds: u64,
     /// Seconds before each of the two that are not measured.
-    #[arg(long, default_value_t = 10)]
+    #[arg(long, default_value_t = 15)]
     settle_seconds: u64,
     /// Rounds on each engine.
     #[arg(long, default_value_t = 5)]
@@ -56,9 +56,9 @@ pub struct TaskArgs {
 /// One round.
 struct Measured {
     /// Each second without work, and with it.
-    idle: Usage,
-    busy: Usage,
-    /// Done each second.
+    idle: Rates,
+    busy: Rates,
+    /// Over each second.
     tasks: f64,
     /// The database's own processes, seconds of CPU each second, without work and with it.
     database: Option<(f64, f64)>,
@@ -92,7 +92,7 @@ async fn measure(args: &TaskArgs, engine: &Engine, requests: &[SubmitTaskRequest
     let (idle, _, database_idle) = spend(args, engine, &mut server, None).await?;
     let work = Submitter { client: TaskServiceClient::new(server.channel().await?), requests, submitted: 0 };
     let (busy, tasks, database_busy) = spend(args, engine, &mut server, Some(work)).await?;
-    ensure!(tasks > 0.0, "no task was done");
+    ensure!(tasks > 0.0, "no task is over");
     drop((robots, server));
     Ok(Measured { idle, busy, tasks, database: database_idle.zip(database_busy) })
 }
@@ -112,15 +112,15 @@ async fn spend(
     engine: &Engine,
     server: &mut Child,
     mut work: Option<Submitter<'_>>,
-) -> anyhow::Result<(Usage, f64, Option<f64>)> {
+) -> anyhow::Result<(Rates, f64, Option<f64>)> {
     pass(args, args.settle_seconds, server, &mut work).await?;
-    let (before, done, database_s) = (Usage::of(server)?, done(server)?, engine.cpu_s()?);
+    let (before, over, database_s) = (Usage::read(server)?, count_over(server)?, engine.cpu_s()?);
     let begun = Instant::now();
     pass(args, args.seconds, server, &mut work).await?;
     let seconds = begun.elapsed().as_secs_f64();
-    let spent = Usage::of(server)?.a_second_since(before, seconds);
+    let spent = Usage::read(server)?.a_second_since(&before, seconds);
     let database = engine.cpu_s()?.zip(database_s).map(|(after_s, before_s)| (after_s - before_s) / seconds);
-    Ok((spent, (self::done(server)? - done) as f64 / seconds, database))
+    Ok((spent, count_over(server)?.saturating_sub(over) as f64 / seconds, database))
 }
 
 /// Lets some seconds go by, with or without work.
@@ -134,18 +134,20 @@ async fn pass(
     let mut due = interval(Duration::from_secs(1) / u32::try_from(args.rate.max(1))?);
     due.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut look = interval(LOOK_EVERY);
-    let mut is_full = false;
     while Instant::now() < end {
         tokio::select! {
-            _ = look.tick() => is_full = server.ask(OPEN)? > OPEN_PER_ROBOT * args.robots as u64,
-            _ = due.tick() => if let Some(work) = work && !is_full { work.submit().await? },
+            _ = look.tick() => {
+                let open = server.ask(OPEN)?;
+                ensure!(open <= OPEN_PER_ROBOT * args.robots as u64, "{open} tasks are open: ask for a lower --rate");
+            }
+            _ = due.tick() => if let Some(work) = work { work.submit().await? },
         }
     }
     Ok(())
 }
 
-/// Tasks that are over.
-fn done(server: &mut Child) -> anyhow::Result<u64> {
+/// Tasks that are over, however they ended. The server counts the open ones at its sweeps.
+fn count_over(server: &mut Child) -> anyhow::Result<u64> {
     Ok(server.ask(ADMITTED)?.saturating_sub(server.ask(OPEN)?))
 }
 
@@ -167,20 +169,22 @@ impl Submitter<'_> {
 }
 
 fn figures(args: &TaskArgs, engine: &Engine, rounds: &[Measured]) -> Vec<Figure> {
-    let load = format!("{} robots, pace {}", args.robots, args.pace);
+    let load = format!("{} robots, {}/s", args.robots, args.rate);
     let name = |what: &str| format!("a task, {what}, {load}{}", engine.suffix());
-    let each = |of: fn(&Usage) -> f64, scale: f64| -> Vec<f64> {
+    let each = |of: fn(&Rates) -> f64, scale: f64| -> Vec<f64> {
         rounds.iter().map(|r| (of(&r.busy) - of(&r.idle)) * scale / r.tasks).collect()
     };
     let a_second = |of: fn(&Measured) -> f64| rounds.iter().map(of).collect::<Vec<_>>();
     let mut figures = vec![
-        Figure::new("P5", name("done each second"), "1/s", &a_second(|r| r.tasks), None),
+        Figure::new("P5", name("over each second"), "1/s", &a_second(|r| r.tasks), None),
         Figure::new("P5", name("server CPU each, less idle"), "ms", &each(|u| u.cpu_s, 1e3), None),
         Figure::new("P5", name("the same robots idle"), "ms/s", &a_second(|r| r.idle.cpu_s * 1e3), None),
         Figure::new("P5", name("context switches each"), "", &each(|u| u.switches, 1.0), None),
         Figure::new("P5", name("commits each"), "", &each(|u| u.groups, 1.0), None),
-        Figure::new("P5", name("written each"), "KB", &each(|u| u.written_bytes, 1e-3), None),
     ];
+    if engine.pid().is_none() {
+        figures.push(Figure::new("P5", name("written each"), "KB", &each(|u| u.written_bytes, 1e-3), None));
+    }
     let database: Vec<f64> = rounds
         .iter()
         .filter_map(|round| round.database.map(|(idle, busy)| (busy - idle) * 1e3 / round.tasks))

@@ -2,33 +2,46 @@
 
 use crate::child::Child;
 use anyhow::Context;
+use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Groups of items that a server has committed, each with one sync of the disk.
+/// Groups of items that a server has committed; on SQLite each is one sync of the disk.
 const GROUPS: &str = "midshift_store_groups_total";
 
 /// Spent since the start of a process.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Debug)]
 pub struct Usage {
-    /// Of all its threads, seconds, in whole clock ticks.
+    cpu_s: f64,
+    /// Of each thread that it has now, wanted and unwanted.
+    switches: BTreeMap<String, f64>,
+    written_bytes: f64,
+    groups: f64,
+}
+
+/// Spent each second of a while.
+#[derive(Clone, Copy, Debug)]
+pub struct Rates {
+    /// Of all threads, seconds.
     pub cpu_s: f64,
-    /// Of the threads that it has now, wanted and unwanted.
+    /// Context switches of the threads that are there at the end of it.
     pub switches: f64,
-    /// Handed to the disk.
+    /// Handed to the disk by the server itself.
     pub written_bytes: f64,
-    /// Committed.
+    /// Groups of items that were committed.
     pub groups: f64,
 }
 
 impl Usage {
-    /// Of a server until now.
-    pub fn of(server: &mut Child) -> anyhow::Result<Self> {
+    /// Reads what a server has spent until now.
+    pub fn read(server: &mut Child) -> anyhow::Result<Self> {
         let process = Path::new("/proc").join(server.pid().to_string());
-        let mut switches = 0.0;
+        let mut switches = BTreeMap::new();
         for thread in std::fs::read_dir(process.join("task"))? {
+            let thread = thread?;
             // One that ended meanwhile counts for nothing.
-            let Ok(status) = std::fs::read_to_string(thread?.path().join("status")) else { continue };
-            switches += field(&status, "voluntary_ctxt_switches:")? + field(&status, "nonvoluntary_ctxt_switches:")?;
+            let Ok(status) = std::fs::read_to_string(thread.path().join("status")) else { continue };
+            let count = field(&status, "voluntary_ctxt_switches:")? + field(&status, "nonvoluntary_ctxt_switches:")?;
+            switches.insert(thread.file_name().to_string_lossy().into_owned(), count);
         }
         let io = std::fs::read_to_string(process.join("io"))?;
         let groups = server.ask(GROUPS)? as f64;
@@ -36,10 +49,11 @@ impl Usage {
     }
 
     /// What was spent from `then` until this, each second.
-    pub fn a_second_since(self, then: Self, seconds: f64) -> Self {
-        Self {
+    pub fn a_second_since(&self, then: &Self, seconds: f64) -> Rates {
+        let of_thread = |(thread, count): (&String, &f64)| count - then.switches.get(thread).unwrap_or(&0.0);
+        Rates {
             cpu_s: (self.cpu_s - then.cpu_s) / seconds,
-            switches: (self.switches - then.switches) / seconds,
+            switches: self.switches.iter().map(of_thread).sum::<f64>() / seconds,
             written_bytes: (self.written_bytes - then.written_bytes) / seconds,
             groups: (self.groups - then.groups) / seconds,
         }

@@ -156,7 +156,7 @@ pub enum AttemptPhase {
     Navigating,
     /// Acting or waiting.
     Executing,
-    /// MachineState with it.
+    /// Standing with it.
     Paused,
     /// Told to stop, not confirmed.
     Stopping,
@@ -257,7 +257,7 @@ pub struct Uncertain {
 pub struct VisitedPlaces {
     /// The ring in which the robot wrote its events when it was given the attempt: what another one tells is not the whole.
     pub ring: String,
-    /// MachineState places at which a step is done and that it entered, or stood in already: at most one a step.
+    /// Standing places at which a step is done and that it entered, or stood in already: at most one a step.
     pub places: BTreeSet<PlaceId>,
     /// The step with which the attempt goes on: those before it were done by attempts before.
     #[serde(default)]

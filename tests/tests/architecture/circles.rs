@@ -47,7 +47,7 @@ fn between_modules(arrows: &Arrows) -> Arrows {
     let mut between = Arrows::new();
     for (from, to) in arrows.iter().flat_map(|(from, to)| to.iter().map(move |to| (names(from), names(to)))) {
         let shared = from.iter().zip(&to).take_while(|(from, to)| from == to).count();
-        // What uses the module around it, or is used by it, stands not beside it.
+        // What uses the module around it, or is used by it, stands not beside it: a circle that leads through a door is not seen here.
         if let (Some(from), Some(to)) = (from.get(..=shared), to.get(..=shared)) {
             between.entry(from.join("/")).or_default().insert(to.join("/"));
         }

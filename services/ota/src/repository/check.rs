@@ -237,7 +237,7 @@ pub async fn read_manifest(digest: Digest, content: &dyn Content) -> Result<Resu
     Ok(Manifest::from_bytes(&bytes).map_err(|refusal| refusal.to_string()))
 }
 
-/// Publishers name, then by version as numbers, then as text.
+/// By name, then by version as numbers, then as text.
 pub fn sort(releases: &mut [Release]) {
     let order = |r: &Release| (r.manifest.name.clone(), parse_version(&r.manifest.version), r.manifest.version.clone());
     releases.sort_by_cached_key(order);
