@@ -321,7 +321,7 @@ pub const SOFTWARE_UNNAMED_DAYS_DEFAULT: u64 = 7;
 pub const ROLLOUT_NAMES_DAYS: u64 = 30;
 /// Serving time between two looks at which software is still named, ms. The first is so long after a start.
 pub const COLLECT_EVERY_MS: u64 = 600_000;
-/// Files that a robot names as there when it asks for a shorter way to another.
+/// Files that a robot names as there when it asks for an encoded target of another.
 pub const ENCODING_BASES_MAX: usize = 8;
 /// A set has been committed for so long before a new base takes the slot of the one before it, ms of UTC on the robot's site clock.
 pub const BASE_SETTLED_MS: u64 = 24 * 3_600_000;

@@ -68,7 +68,7 @@ const SYNCED_BY_HAND: &[(&str, &str)] = &[
     ("cli/src/samples.rs", "a second name for a file that is there"),
     ("latch/src/lib.rs", "a slot is written where it lies"),
     ("ota_bundles/src/build.rs", "a component goes through its hash as it is copied"),
-    ("ota_bundles/src/folder/encoded_targets.rs", "a shorter way is made a piece at a time"),
+    ("ota_bundles/src/folder/encoded_targets.rs", "an encoded target is made a piece at a time"),
     ("robot_agent/src/sets/content.rs", "a download comes a piece at a time"),
     ("robot_agent/src/sets/disk.rs", "content is made a piece at a time and read back by the same handle"),
     ("robot_agent/src/sets/slots.rs", "a slot stands for a partition, which has no other beside it"),

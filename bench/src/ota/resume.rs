@@ -116,7 +116,7 @@ pub async fn run(args: &ResumeArgs, seed: u64, room: &Path) -> anyhow::Result<Ve
     releases.push(&server).await?;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let [mut uncut, mut lost, mut killed]: [Vec<f64>; 3] = Default::default();
-    // The first one waits until the server has found that there is no shorter way.
+    // The first one waits until the server has found that there is no encoded target.
     download(&server, &release, room, Cut::Never, &[]).await?;
     for _ in 0..args.device_rounds {
         for (cut, all) in [(Cut::Never, &mut uncut), (Cut::Connection, &mut lost), (Cut::Process, &mut killed)] {

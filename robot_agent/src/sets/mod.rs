@@ -138,13 +138,13 @@ pub trait Sets: Send {
     /// # Errors
     /// [`Error::Corrupt`]: all of it is thrown away.
     fn seal(&mut self, wanted: &FileRef) -> Result<(), Error>;
-    /// Makes content of a shorter way to it that is there whole, from `base` if it is a patch, and checks it as
-    /// [`Sets::seal`] does. The shorter way goes, whatever comes of it. Nothing to do if the content is there already.
+    /// Makes content of an encoded target of it that is there whole, from `base` if it is a patch, and checks it as
+    /// [`Sets::seal`] does. The encoded target goes, whatever comes of it. Nothing to do if the content is there already.
     ///
     /// # Errors
     /// [`Error::Corrupt`] if it does not lead to what is wanted; a base that is not there; the disk's.
     fn decode(&mut self, wanted: &FileRef, base: Option<&Digest>, encoded: &FileRef) -> Result<(), Error>;
-    /// No shorter way to this file is tried any more; durable, until the file is there.
+    /// No encoded target of this file is tried any more; durable, until the file is there.
     ///
     /// # Errors
     /// The disk's.

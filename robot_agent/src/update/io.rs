@@ -280,16 +280,16 @@ impl UpdateWorker {
         let missing = self.on_disk(move |sets| sets.missing(&wanted)).await.map_err(stopped)?;
         let begun = missing.iter().map(|range| range.end - range.start).sum::<u64>() < wanted.length;
         let noted = self.on_disk(move |sets| sets.is_fetched_as_it_is(&wanted)).await.map_err(stopped)?;
-        if may_come_encoded(wanted.length) && !begun && !noted && self.fetch_shorter(wanted, bases, pace, leave).await?
+        if may_come_encoded(wanted.length) && !begun && !noted && self.fetch_encoded(wanted, bases, pace, leave).await?
         {
             return Ok(());
         }
         self.fetch_whole(wanted, pace, leave).await
     }
 
-    /// Whether a shorter way led to the file. One that did not is noted before anything else is tried, so that it is
+    /// Whether an encoded target led to the file. One that did not is noted before anything else is tried, so that it is
     /// not tried again.
-    async fn fetch_shorter(
+    async fn fetch_encoded(
         &self,
         wanted: FileRef,
         bases: &[Digest],
@@ -312,7 +312,7 @@ impl UpdateWorker {
         Ok(false)
     }
 
-    /// A shorter way that the server names and that can lead there.
+    /// An encoded target that the server names and that can lead there.
     async fn shorter(&self, wanted: FileRef, bases: &[Digest]) -> Result<Option<(Option<Digest>, FileRef)>, Stop> {
         let DownloadPlan::Shorter { base, encoded } =
             self.remote.plan_download(&wanted, bases).await.map_err(unreached)?

@@ -59,7 +59,7 @@ enum Wrong {
     Silent,
     /// Every call is refused.
     Refuses,
-    /// It knows no shorter ways.
+    /// It knows no encoded targets.
     Old,
 }
 

@@ -138,7 +138,7 @@ pub fn must_be_of(folder: &Path, expected: &StoreId) -> Result<(), Error> {
     Err(Error::NoMarker { folder: folder.to_owned(), expected: expected.clone() })
 }
 
-/// Takes away what servers once made of files and nobody reads any more: who signs a release makes its shorter ways. Blocks.
+/// Takes away what servers once made of files and nobody reads any more: who signs a release makes its encoded targets. Blocks.
 pub fn remove_encoded(folder: &Path) {
     let encoded = folder.join(ENCODED);
     match fs::remove_dir_all(&encoded) {

@@ -76,8 +76,8 @@ impl OtaService {
         opened.repository.documents().look_if_possible().await;
         let newest = opened.repository.newest();
         let releases = newest.as_ref().map(|newest| newest.releases.as_slice()).unwrap_or_default();
-        let way_bytes = newest.as_ref().map_or(0, |newest| newest.encoded_bytes());
-        let room = pages::room(opened.content.fill(), way_bytes, opened.collector.newest());
+        let encoded_bytes = newest.as_ref().map_or(0, |newest| newest.encoded_bytes());
+        let room = pages::room(opened.content.fill(), encoded_bytes, opened.collector.newest());
         let page = pages::page(releases, room, r).map_err(|bad| Refusal::invalid(bad.0))?;
         let keyless = opened.repository.directive_key().err().map(|keyless| shown(&keyless.reason()));
         Ok(v1::ListBundlesResponse { keyless, ..page })

@@ -269,7 +269,7 @@ impl Bench {
         Ok(self.fetched.load(Ordering::Relaxed) - before)
     }
 
-    /// How long the shorter way is that was signed from the one release to the other, or to a robot that has none.
+    /// How long the encoded target is that was signed from the one release to the other, or to a robot that has none.
     fn way(&self, from: Option<usize>, to: usize) -> anyhow::Result<u64> {
         let targets =
             Folder::open(&self.made.repository)?.document(&format!("{}.targets.json", self.made.targets_version));

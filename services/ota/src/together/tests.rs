@@ -483,7 +483,7 @@ async fn a_gateway_tells_robots_of_the_patches_that_are_listed() {
     let digest = answer.encoded_digest.parse().expect("a digest");
     assert_eq!(fetched(&reader.downloads, digest, answer.encoded_length).await.expect("there"), patch.1);
     let answer = encoding(&reader.downloads, target, &[]).await.expect("listed");
-    assert_eq!(answer.encoding(), v1::Encoding::Identity, "the whole of it has no shorter way");
+    assert_eq!(answer.encoding(), v1::Encoding::Identity, "the whole of it has no encoded target");
 }
 
 #[tokio::test]

@@ -119,7 +119,7 @@ pub(super) async fn head(connection: &mut PgConnection, site_id: &SiteId, head: 
 }
 
 /// Where some rows stand. Every key asked for is in the answer.
-pub(super) async fn standings<'k>(
+pub(super) async fn read_current_revisions<'k>(
     connection: &mut PgConnection,
     site_id: &SiteId,
     keys: impl Iterator<Item = &'k Key>,

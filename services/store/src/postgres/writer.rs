@@ -182,7 +182,7 @@ impl AsyncWork<(Vec<Results>, Seq)> for GroupCommit {
         head: Seq,
     ) -> Result<((Vec<Results>, Seq), bool), sqlx::Error> {
         let keys = self.items.iter().flatten().flat_map(|item| &item.rows).map(|change| &change.key);
-        let base = write_sql::standings(connection, site_id, keys).await?;
+        let base = write_sql::read_current_revisions(connection, site_id, keys).await?;
         let silent: Vec<&Silent> = self.items.iter().flatten().filter_map(|item| item.silent.as_ref()).collect();
         let heard = broken_silence(connection, site_id, &silent).await?;
         let is_audited = self.items.iter().flatten().any(|item| item.note.is_some());

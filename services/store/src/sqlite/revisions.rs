@@ -18,19 +18,19 @@ pub(super) struct Revisions {
 
 impl Revisions {
     pub(super) fn get(&mut self, key: &Key) -> Option<CurrentRevision> {
-        if let Some(standing) = self.young.get(key) {
-            return Some(*standing);
+        if let Some(revision) = self.young.get(key) {
+            return Some(*revision);
         }
-        let standing = *self.old.get(key)?;
-        self.note(key.clone(), standing);
-        Some(standing)
+        let revision = *self.old.get(key)?;
+        self.note(key.clone(), revision);
+        Some(revision)
     }
 
-    pub(super) fn note(&mut self, key: Key, standing: CurrentRevision) {
+    pub(super) fn note(&mut self, key: Key, revision: CurrentRevision) {
         if self.young.len() >= GENERATION_KEYS {
             self.old = std::mem::take(&mut self.young);
         }
-        self.young.insert(key, standing);
+        self.young.insert(key, revision);
     }
 
     pub(super) fn forget_all(&mut self) {

@@ -160,7 +160,7 @@ pub(super) async fn head(connection: &mut SqliteConnection, site_id: &SiteId, he
 }
 
 /// Where some rows of the file stand. Every key asked for is in the answer.
-pub(super) async fn standings(
+pub(super) async fn read_current_revisions(
     connection: &mut SqliteConnection,
     site_id: &SiteId,
     keys: Vec<Key>,

@@ -58,19 +58,19 @@ impl Writer {
             if base.contains_key(&change.key) {
                 continue;
             }
-            let standing = self.revisions.get(&change.key);
-            if standing.is_none() {
+            let revision = self.revisions.get(&change.key);
+            if revision.is_none() {
                 missing.push(change.key.clone());
             }
-            base.insert(change.key.clone(), standing.flatten());
+            base.insert(change.key.clone(), revision.flatten());
         }
         if !missing.is_empty() {
             let connection = self.connection.as_mut().ok_or_else(closed)?;
-            let found = write_sql::standings(connection, &self.site_id, missing).await;
+            let found = write_sql::read_current_revisions(connection, &self.site_id, missing).await;
             let found = found.map_err(|error| self.fail(error))?;
-            for (key, standing) in found {
-                self.revisions.note(key.clone(), standing);
-                base.insert(key, standing);
+            for (key, revision) in found {
+                self.revisions.note(key.clone(), revision);
+                base.insert(key, revision);
             }
         }
         let is_audited = items.iter().flatten().any(|item| item.note.is_some());
