@@ -105,8 +105,8 @@ impl Item {
             silent: None,
         }
     }
-    /// An item that says alone that something was refused as things are. None: what is wrong in form, or is about nothing that there is, is no
-    /// decision.
+    /// An item that says alone that something was refused as things are. None: what is wrong in form, or is about nothing
+    /// that there is, is no decision.
     pub fn for_refusal(
         writer: Writer,
         actor: impl Into<Actor>,

@@ -41,8 +41,8 @@ pub struct Session {
     /// That other key, 64 hexadecimal digits; none: it did not change.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub other_device_key: Option<String>,
-    /// When the robot was enrolled, as this session found it, UTC unix ms: what was known of its machine holds for that enrolment. None: it showed no
-    /// certificate.
+    /// When the robot was enrolled, as this session found it, UTC unix ms: what was known of its machine holds for that
+    /// enrolment. None: it showed no certificate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub enrolled_unix_ms: Option<i64>,
 }

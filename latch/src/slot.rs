@@ -1,4 +1,4 @@
-//! The bytes of one slot: a mark, the generation, the length, a checksum over both and the payload, then the payload.
+//! The bytes of one slot: a mark, the generation, the length, a checksum over generation and payload, then the payload.
 
 use crate::error::Error;
 use crc::{CRC_64_XZ, Crc};
