@@ -27,6 +27,7 @@ mod task;
 mod unary_baseline;
 mod usage;
 mod watch;
+mod worker;
 
 use clap::{Parser, Subcommand};
 use std::future::Future;

@@ -6,6 +6,7 @@ use crate::questions::answer_questions;
 use crate::session_baseline::Seen;
 use anyhow::Context;
 use midshift::robots::{IdentityFlags, SimRun, StopFlags};
+use midshift_core::site::{DEMO, text};
 use midshift_server::serve::Serve;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -66,6 +67,13 @@ pub enum Role {
     Hearers(crate::ota::hearers::HearersArgs),
     /// Real agents with simulated bodies, who take software if they know whose.
     Swarm(crate::swarm::SwarmArgs),
+    /// Robots that do in no time what they are given, on the demo site.
+    Workers {
+        #[arg(long)]
+        server: String,
+        #[arg(long)]
+        robots: usize,
+    },
     /// Robots that send as fast as they may.
     Flood {
         #[arg(long)]
@@ -164,6 +172,10 @@ async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {
         Role::Swarm(args) => {
             answer_questions(address, stop.clone(), |_| 0)?;
             crate::swarm::run(args, stop).await
+        }
+        Role::Workers { server, robots } => {
+            answer_questions(address, stop.clone(), |_| 0)?;
+            crate::worker::run(server, text::parse(DEMO)?, robots, stop).await
         }
         Role::Flood { server, robots, unacknowledged } => {
             let acked = Arc::new(AtomicU64::new(0));

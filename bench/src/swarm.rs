@@ -21,9 +21,6 @@ pub struct SwarmArgs {
     /// How many.
     #[arg(long)]
     pub robots: usize,
-    /// How many times as fast as real ones they drive.
-    #[arg(long, default_value_t = 1.0)]
-    pub pace: f64,
     /// Whose software they take; without it none.
     #[arg(long)]
     pub trust: Option<PathBuf>,
@@ -35,7 +32,6 @@ pub async fn run(args: SwarmArgs, stop: CancellationToken) -> anyhow::Result<()>
     let clock: Arc<dyn Clock> = midshift_process::clock::clock(1000);
     let mut config = FleetConfig::new(site, args.robots, SEED);
     (config.faults, config.drains) = (FaultRates::none(), false);
-    config.pace_permille = (args.pace * 1000.0) as u32;
     let hall = Arc::new(Fleet::open(&config, &clock.now())?);
     let uri = midshift_cli::endpoint::uri(&args.server);
     let mut swarm = SwarmConfig::tcp(hall, clock, &uri, SEED);

@@ -1,15 +1,15 @@
-//! What a task costs the server from its submit until it is over: CPU, context switches, bytes and commits, less what the same robots,
-//! which are simulated, cost in the same run before while they had nothing to do. So what grows with a store counts as cost of tasks.
+//! What a task costs the server from its submit until it is over: CPU, context switches, bytes and commits, less what the same robots cost in
+//! the same run before, while they had nothing to do. So what grows with a store counts as cost of tasks.
 //!
-//! The server and the robots have a core each; whoever submits, and PostgreSQL, run on all. Its CPU is told for itself. Robots drive many
-//! times as fast as real ones; their hands keep real time, so that a transport takes eight seconds at least.
+//! The robots do in no time what they are given. The server and they have a core each; whoever submits, and PostgreSQL, run on all. Its CPU is
+//! told for itself.
 
 use crate::child::{Child, SESSIONS};
-use crate::engine::{Bed, Engine, EngineArgs};
+use crate::engine::{Engine, EngineArgs};
 use crate::figure::Figure;
 use crate::submit::transports;
 use crate::usage::{Rates, Usage};
-use anyhow::{Context, ensure};
+use anyhow::ensure;
 use midshift_core::site::{DEMO, text};
 use midshift_proto::task::v1::SubmitTaskRequest;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
@@ -35,11 +35,8 @@ pub struct TaskArgs {
     #[arg(long, default_value_t = 20)]
     robots: usize,
     /// Tasks a second.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 32)]
     rate: u64,
-    /// How many times as fast as real ones the robots drive.
-    #[arg(long, default_value_t = 50.0)]
-    pace: f64,
     /// Seconds measured of each round, first idle, then at work. CPU is counted in hundredths of a second.
     #[arg(long, default_value_t = 60)]
     seconds: u64,
@@ -83,7 +80,7 @@ pub async fn run(args: TaskArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figur
 async fn measure(args: &TaskArgs, engine: &Engine, requests: &[SubmitTaskRequest]) -> anyhow::Result<Measured> {
     let bed = engine.bed(args.engine.dir.as_ref())?;
     let mut server = bed.serve(None, Some(0)).await?;
-    let robots = start_robots(args, &bed, &server)?;
+    let robots = start_robots(args, &server)?;
     let end = Instant::now() + ATTACH_WITHIN;
     while (server.ask(SESSIONS)? as usize) < args.robots {
         ensure!(Instant::now() < end, "{} of {} robots are attached", server.ask(SESSIONS)?, args.robots);
@@ -97,13 +94,9 @@ async fn measure(args: &TaskArgs, engine: &Engine, requests: &[SubmitTaskRequest
     Ok(Measured { idle, busy, tasks, database: database_idle.zip(database_busy) })
 }
 
-fn start_robots(args: &TaskArgs, bed: &Bed<'_>, server: &Child) -> anyhow::Result<Child> {
-    let site = bed.path().join("demo.site.toml");
-    std::fs::write(&site, DEMO)?;
-    let site = site.to_str().context("a path that is no text")?;
-    let (address, robots, pace) = (server.address.to_string(), args.robots.to_string(), args.pace.to_string());
-    let role = ["swarm", "--server", &address, "--site", site, "--robots", &robots, "--pace", &pace];
-    Child::start(&role, Some(1))
+fn start_robots(args: &TaskArgs, server: &Child) -> anyhow::Result<Child> {
+    let (address, robots) = (server.address.to_string(), args.robots.to_string());
+    Child::start(&["workers", "--server", &address, "--robots", &robots], Some(1))
 }
 
 /// What the server spends each second, what it has done each second, and the database's CPU, after a while to settle.
