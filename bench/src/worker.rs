@@ -104,7 +104,8 @@ impl Worker {
             reported.vitals.waypoint = Some(point.waypoint.clone());
             reported.vitals.odometer_mm += 1_000;
             let entered = point.passages.iter().chain(&point.standing);
-            let entered: Vec<_> = entered.filter(|place| reported.places.iter().all(|h| h.place_id != **place)).collect();
+            let entered: Vec<_> =
+                entered.filter(|place| reported.places.iter().all(|h| h.place_id != **place)).collect();
             if !entered.is_empty() {
                 for left in reported.places.drain(..) {
                     events.push(news(&left, PlaceNews::Left));
