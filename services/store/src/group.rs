@@ -7,8 +7,32 @@ use crate::audit::{AuditDrafts, Heads};
 use crate::check::{After, decide};
 use crate::{Applied, CommitError};
 use midshift_core::item::Item;
-use midshift_core::rows::{Entry, Key, Revision, Row, Seq, Table, Writer};
+use midshift_core::rows::{Entry, Key, Log, Revision, Row, Seq, Table, Writer};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+/// Rows by table: what becomes of each that stays, and the ids of those that go.
+pub(crate) type ByTable<'r> = (BTreeMap<Table, Vec<&'r Row>>, BTreeMap<Table, Vec<&'r str>>);
+
+/// Puts rows into the tables that they belong to.
+pub(crate) fn sort_by_table(rows: &BTreeMap<Key, Option<Row>>) -> ByTable<'_> {
+    let (mut put, mut gone) = ByTable::default();
+    for (key, row) in rows {
+        match row {
+            Some(row) => put.entry(key.table).or_default().push(row),
+            None => gone.entry(key.table).or_default().push(&*key.id),
+        }
+    }
+    (put, gone)
+}
+
+/// Puts entries into their logs, in their order.
+pub(crate) fn sort_by_log(entries: &[Entry]) -> BTreeMap<Log, Vec<&Entry>> {
+    let mut logs: BTreeMap<Log, Vec<&Entry>> = BTreeMap::new();
+    for entry in entries {
+        logs.entry(entry.log).or_default().push(entry);
+    }
+    logs
+}
 
 /// A revision, or the knowledge that there is no such row.
 pub(crate) type CurrentRevision = Option<Revision>;

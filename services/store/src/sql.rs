@@ -35,8 +35,10 @@ pub(crate) const MARK_LOG: &str = "INSERT INTO log_mark (site_id, log, pruned_se
      ON CONFLICT (site_id, log) DO UPDATE SET pruned_seq = excluded.pruned_seq";
 /// Where each chain of the audit stands, as it was noted with its newest row.
 pub(crate) const AUDIT_HEADS: &str = "SELECT chain, n, hash, NULL AS body FROM audit_head WHERE site_id = $1";
-pub(crate) const MOVE_AUDIT_HEAD: &str = "INSERT INTO audit_head (site_id, chain, n, hash) VALUES ($1, $2, $3, $4) \
-     ON CONFLICT (site_id, chain) DO UPDATE SET n = excluded.n, hash = excluded.hash";
+/// What stands before the values of a chain, and behind them.
+pub(crate) const MOVE_AUDIT_HEAD: &str = "INSERT INTO audit_head (site_id, chain, n, hash) VALUES";
+pub(crate) const MOVED_AUDIT_HEAD: &str =
+    "ON CONFLICT (site_id, chain) DO UPDATE SET n = excluded.n, hash = excluded.hash";
 pub(crate) const FRAME_SIZES: &str =
     "SELECT position, size, at_unix_ms FROM frame_log WHERE site_id = $1 AND position > $2 ORDER BY position LIMIT $3";
 pub(crate) const FRAME_BODIES: &str = "SELECT position, at_unix_ms, body FROM frame_log \

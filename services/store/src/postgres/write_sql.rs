@@ -3,117 +3,149 @@
 //! Invariant: as [`crate::sql`].
 
 use crate::audit::{self, Heads};
-use crate::group::{CurrentRevision, Group};
-use crate::sql::{self, ENTRY_COLUMNS, ROW_COLUMNS, ROW_CONFLICT, ord};
+use crate::group::{CurrentRevision, Group, sort_by_log, sort_by_table};
+use crate::sql::{self, ENTRY_COLUMNS, MOVE_AUDIT_HEAD, MOVED_AUDIT_HEAD, ROW_COLUMNS, ROW_CONFLICT, ord};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Revision, Row, Seq, Table};
-use sqlx::{AssertSqlSafe, PgConnection, Row as _};
+use sqlx::postgres::PgArguments;
+use sqlx::{Arguments, AssertSqlSafe, Encode, Error, PgConnection, Postgres, Row as _, Type};
 use std::collections::{BTreeMap, HashMap};
 
-/// Writes what a group leaves of its rows.
-pub(super) async fn rows(
+/// A statement of several parts, which all see what was there before it. Values are numbered through all of them; `$1` is the site.
+struct Parts {
+    sql: Vec<String>,
+    values: PgArguments,
+}
+
+impl Parts {
+    fn new(site_id: &SiteId) -> Result<Self, Error> {
+        let mut parts = Self { sql: Vec::new(), values: PgArguments::default() };
+        parts.bind(site_id.as_str())?;
+        Ok(parts)
+    }
+
+    /// Adds a value, and says what stands for it.
+    fn bind<'q, T: Encode<'q, Postgres> + Type<Postgres> + 'q>(&mut self, value: T) -> Result<String, Error> {
+        let kind = T::type_info();
+        self.values.add(value).map_err(Error::Encode)?;
+        Ok(format!("${}::{kind}", self.values.len()))
+    }
+
+    fn add_rows(&mut self, rows: &BTreeMap<Key, Option<Row>>) -> Result<(), Error> {
+        let (put, gone) = sort_by_table(rows);
+        for (table, rows) in put {
+            let columns = [
+                self.bind(column(&rows, |row| &*row.key.id))?,
+                self.bind(column(&rows, |row| row.revision.0.cast_signed()))?,
+                self.bind(column(&rows, |row| row.index.state))?,
+                self.bind(column(&rows, |row| row.index.parent.as_deref()))?,
+                self.bind(column(&rows, |row| ord(row.index.order)))?,
+                self.bind(column(&rows, |row| &*row.body))?,
+            ];
+            self.sql.push(format!(
+                "INSERT INTO {} ({ROW_COLUMNS}) SELECT $1, row.* FROM UNNEST({}) AS row {ROW_CONFLICT}",
+                table.name(),
+                columns.join(", "),
+            ));
+        }
+        for (table, ids) in gone {
+            let ids = self.bind(ids)?;
+            self.sql.push(format!("DELETE FROM {} WHERE site_id = $1 AND id = ANY({ids})", table.name()));
+        }
+        Ok(())
+    }
+
+    fn add_entries(&mut self, entries: &[Entry]) -> Result<(), Error> {
+        for (log, entries) in sort_by_log(entries) {
+            let columns = [
+                self.bind(column(&entries, |entry| entry.seq.0.cast_signed()))?,
+                self.bind(column(&entries, |entry| entry.table.map(Table::name)))?,
+                self.bind(column(&entries, |entry| &*entry.subject))?,
+                self.bind(column(&entries, |entry| entry.revision.0.cast_signed()))?,
+                self.bind(column(&entries, |entry| entry.index.state))?,
+                self.bind(column(&entries, |entry| entry.index.parent.as_deref()))?,
+                self.bind(column(&entries, |entry| entry.index.order))?,
+                self.bind(column(&entries, |entry| entry.body.as_deref()))?,
+                self.bind(column(&entries, |entry| &*entry.kind))?,
+                self.bind(column(&entries, |entry| &*entry.actor))?,
+                self.bind(column(&entries, |entry| entry.request_id.as_deref()))?,
+                self.bind(column(&entries, |entry| entry.at_unix_ms))?,
+            ];
+            self.sql.push(format!(
+                "INSERT INTO {} ({ENTRY_COLUMNS}) SELECT $1, entry.* FROM UNNEST({}) AS entry",
+                log.name(),
+                columns.join(", "),
+            ));
+        }
+        Ok(())
+    }
+
+    /// Moves the heads of the chains that grew, and takes what was cut.
+    fn add_audit(&mut self, group: &Group) -> Result<(), Error> {
+        for writer in &group.audited_writers {
+            let head = group.chains.get(writer).cloned().unwrap_or_default();
+            let values = [self.bind(writer.as_str())?, self.bind(head.n.cast_signed())?, self.bind(head.hash)?];
+            self.sql.push(format!("{MOVE_AUDIT_HEAD} ($1, {}) {MOVED_AUDIT_HEAD}", values.join(", ")));
+        }
+        for (table, up_to) in &group.cuts {
+            let up_to = self.bind(up_to.cast_signed())?;
+            self.sql.push(format!("DELETE FROM {} WHERE site_id = $1 AND ord <= {up_to}", table.name()));
+        }
+        Ok(())
+    }
+
+    /// Runs all of it.
+    async fn run(self, connection: &mut PgConnection) -> Result<(), Error> {
+        let Some((last, first)) = self.sql.split_last() else { return Ok(()) };
+        let named = first.iter().enumerate().map(|(number, sql)| format!("part_{number} AS ({sql})"));
+        let named = named.collect::<Vec<_>>().join(", ");
+        let sql = if named.is_empty() { last.clone() } else { format!("WITH {named} {last}") };
+        sqlx::query_with(AssertSqlSafe(sql), self.values).execute(connection).await.map(drop)
+    }
+}
+
+/// One column of some rows.
+fn column<'r, R, T>(rows: &[&'r R], value: impl Fn(&'r R) -> T) -> Vec<T> {
+    rows.iter().map(|row| value(row)).collect()
+}
+
+/// Writes what a group leaves.
+pub(super) async fn write_group(connection: &mut PgConnection, site_id: &SiteId, group: &Group) -> Result<(), Error> {
+    let mut parts = Parts::new(site_id)?;
+    parts.add_rows(&group.rows)?;
+    parts.add_entries(&group.entries)?;
+    parts.add_audit(group)?;
+    let head = parts.bind(group.head.0.cast_signed())?;
+    parts.sql.push(format!("UPDATE store_head SET seq = {head} WHERE site_id = $1"));
+    parts.run(connection).await
+}
+
+/// Writes rows alone.
+pub(super) async fn write_rows(
     connection: &mut PgConnection,
     site_id: &SiteId,
     rows: &BTreeMap<Key, Option<Row>>,
-) -> Result<(), sqlx::Error> {
-    let mut put: BTreeMap<Table, Vec<&Row>> = BTreeMap::new();
-    let mut gone: BTreeMap<Table, Vec<&str>> = BTreeMap::new();
-    for (key, row) in rows {
-        match row {
-            Some(row) => put.entry(key.table).or_default().push(row),
-            None => gone.entry(key.table).or_default().push(&key.id),
-        }
-    }
-    for (table, rows) in put {
-        sqlx::query(AssertSqlSafe(format!(
-            "INSERT INTO {} ({ROW_COLUMNS}) SELECT $1, row.* FROM \
-             UNNEST($2::text[], $3::bigint[], $4::bigint[], $5::text[], $6::bigint[], $7::text[]) AS row {ROW_CONFLICT}",
-            table.name(),
-        )))
-        .bind(site_id.as_str())
-        .bind(rows.iter().map(|row| &*row.key.id).collect::<Vec<_>>())
-        .bind(rows.iter().map(|row| row.revision.0.cast_signed()).collect::<Vec<_>>())
-        .bind(rows.iter().map(|row| row.index.state).collect::<Vec<_>>())
-        .bind(rows.iter().map(|row| row.index.parent.as_deref()).collect::<Vec<_>>())
-        .bind(rows.iter().map(|row| ord(row.index.order)).collect::<Vec<_>>())
-        .bind(rows.iter().map(|row| &*row.body).collect::<Vec<_>>())
-        .execute(&mut *connection)
-        .await?;
-    }
-    for (table, ids) in gone {
-        sqlx::query(AssertSqlSafe(format!("DELETE FROM {} WHERE site_id = $1 AND id = ANY($2)", table.name())))
-            .bind(site_id.as_str())
-            .bind(ids)
-            .execute(&mut *connection)
-            .await?;
-    }
-    Ok(())
-}
-
-/// Appends a group's entries to their logs.
-pub(super) async fn entries(
-    connection: &mut PgConnection,
-    site_id: &SiteId,
-    entries: &[Entry],
-) -> Result<(), sqlx::Error> {
-    for log in Log::ALL {
-        let of_log: Vec<&Entry> = entries.iter().filter(|e| e.log == log).collect();
-        if of_log.is_empty() {
-            continue;
-        }
-        sqlx::query(AssertSqlSafe(format!(
-            "INSERT INTO {} ({ENTRY_COLUMNS}) SELECT $1, entry.* FROM \
-             UNNEST($2::bigint[], $3::text[], $4::text[], $5::bigint[], $6::bigint[], $7::text[], $8::bigint[], \
-             $9::text[], $10::text[], $11::text[], $12::text[], $13::bigint[]) AS entry",
-            log.name(),
-        )))
-        .bind(site_id.as_str())
-        .bind(of_log.iter().map(|e| e.seq.0.cast_signed()).collect::<Vec<_>>())
-        .bind(of_log.iter().map(|e| e.table.map(Table::name)).collect::<Vec<_>>())
-        .bind(of_log.iter().map(|e| &*e.subject).collect::<Vec<_>>())
-        .bind(of_log.iter().map(|e| e.revision.0.cast_signed()).collect::<Vec<_>>())
-        .bind(of_log.iter().map(|e| e.index.state).collect::<Vec<_>>())
-        .bind(of_log.iter().map(|e| e.index.parent.as_deref()).collect::<Vec<_>>())
-        .bind(of_log.iter().map(|e| e.index.order).collect::<Vec<_>>())
-        .bind(of_log.iter().map(|e| e.body.as_deref()).collect::<Vec<_>>())
-        .bind(of_log.iter().map(|e| &*e.kind).collect::<Vec<_>>())
-        .bind(of_log.iter().map(|e| &*e.actor).collect::<Vec<_>>())
-        .bind(of_log.iter().map(|e| e.request_id.as_deref()).collect::<Vec<_>>())
-        .bind(of_log.iter().map(|e| e.at_unix_ms).collect::<Vec<_>>())
-        .execute(&mut *connection)
-        .await?;
-    }
-    Ok(())
+) -> Result<(), Error> {
+    let mut parts = Parts::new(site_id)?;
+    parts.add_rows(rows)?;
+    parts.run(connection).await
 }
 
 /// Where the chains of the audit stand. Nobody moves them while the head row is locked.
-pub(super) async fn chains(connection: &mut PgConnection, site_id: &SiteId) -> Result<Heads, sqlx::Error> {
+pub(super) async fn chains(connection: &mut PgConnection, site_id: &SiteId) -> Result<Heads, Error> {
     let rows = sqlx::query(AssertSqlSafe(audit::select_heads())).bind(site_id.as_str()).fetch_all(connection).await?;
     audit::heads(&rows)
 }
 
-/// Moves the heads of the chains that grew, and takes what was cut.
-pub(super) async fn grow(connection: &mut PgConnection, site_id: &SiteId, group: &Group) -> Result<(), sqlx::Error> {
-    for writer in &group.audited_writers {
-        let head = group.chains.get(writer).cloned().unwrap_or_default();
-        let upsert = sqlx::query(sql::MOVE_AUDIT_HEAD).bind(site_id.as_str()).bind(writer.as_str());
-        upsert.bind(head.n.cast_signed()).bind(head.hash).execute(&mut *connection).await?;
-    }
-    for (table, up_to) in &group.cuts {
-        let delete = sqlx::query(AssertSqlSafe(sql::cut(*table))).bind(site_id.as_str()).bind(up_to.cast_signed());
-        delete.execute(&mut *connection).await?;
-    }
-    Ok(())
-}
-
-/// Locks the site's head row until the end of the transaction, and reads the newest number given.
-pub(super) async fn lock_head(connection: &mut PgConnection, site_id: &SiteId) -> Result<Seq, sqlx::Error> {
-    let row = sqlx::query("SELECT seq FROM store_head WHERE site_id = $1 FOR UPDATE").bind(site_id.as_str());
-    sql::seq(&row.fetch_one(connection).await?, 0)
+/// Begins a transaction, locks the site's head row until its end, and reads the newest number given.
+pub(super) async fn begin(connection: &mut PgConnection, site_id: &SiteId) -> Result<Seq, Error> {
+    // In one trip, which has no binds: a site's id has no character that ends a text.
+    let lock = format!("BEGIN; SELECT seq FROM store_head WHERE site_id = '{site_id}' FOR UPDATE");
+    sql::seq(&sqlx::raw_sql(AssertSqlSafe(lock)).fetch_one(connection).await?, 0)
 }
 
 /// Moves the head row.
-pub(super) async fn head(connection: &mut PgConnection, site_id: &SiteId, head: Seq) -> Result<(), sqlx::Error> {
+pub(super) async fn head(connection: &mut PgConnection, site_id: &SiteId, head: Seq) -> Result<(), Error> {
     let update = sqlx::query(sql::MOVE_HEAD).bind(head.0.cast_signed()).bind(site_id.as_str());
     update.execute(connection).await.map(drop)
 }
@@ -123,22 +155,27 @@ pub(super) async fn read_current_revisions<'k>(
     connection: &mut PgConnection,
     site_id: &SiteId,
     keys: impl Iterator<Item = &'k Key>,
-) -> Result<HashMap<Key, CurrentRevision>, sqlx::Error> {
+) -> Result<HashMap<Key, CurrentRevision>, Error> {
     let mut found: HashMap<Key, CurrentRevision> = keys.map(|key| (key.clone(), None)).collect();
     let mut ids: BTreeMap<Table, Vec<String>> = BTreeMap::new();
     // An item with such an id is refused when it is judged.
     for key in found.keys().filter(|key| is_text(&key.id)) {
         ids.entry(key.table).or_default().push(key.id.to_string());
     }
-    for (table, ids) in ids {
-        let select = sqlx::query(AssertSqlSafe(format!(
-            "SELECT id, revision FROM {} WHERE site_id = $1 AND id = ANY($2)",
-            table.name()
-        )));
-        for row in select.bind(site_id.as_str()).bind(ids).fetch_all(&mut *connection).await? {
-            let revision = Revision(row.try_get::<i64, _>(1)?.cast_unsigned());
-            found.insert(Key::new(table, row.try_get::<&str, _>(0)?), Some(revision));
-        }
+    let mut parts = Parts::new(site_id)?;
+    for (table, ids) in &ids {
+        let (name, ids) = (table.name(), parts.bind(ids)?);
+        parts.sql.push(format!("SELECT '{name}', id, revision FROM {name} WHERE site_id = $1 AND id = ANY({ids})"));
+    }
+    if ids.is_empty() {
+        return Ok(found);
+    }
+    let select = sqlx::query_with(AssertSqlSafe(parts.sql.join(" UNION ALL ")), parts.values);
+    for row in select.fetch_all(connection).await? {
+        let name: &str = row.try_get(0)?;
+        let Some(table) = ids.keys().find(|table| table.name() == name) else { continue };
+        let revision = Revision(row.try_get::<i64, _>(2)?.cast_unsigned());
+        found.insert(Key::new(*table, row.try_get::<&str, _>(1)?), Some(revision));
     }
     Ok(found)
 }
@@ -149,12 +186,7 @@ pub(super) fn is_text(text: &str) -> bool {
 }
 
 /// Takes the entries of a log up to `up_to` out, and remembers that they are gone.
-pub(super) async fn prune(
-    connection: &mut PgConnection,
-    site_id: &SiteId,
-    log: Log,
-    up_to: Seq,
-) -> Result<(), sqlx::Error> {
+pub(super) async fn prune(connection: &mut PgConnection, site_id: &SiteId, log: Log, up_to: Seq) -> Result<(), Error> {
     let up_to = up_to.0.cast_signed();
     let delete = sqlx::query(AssertSqlSafe(sql::prune(log))).bind(site_id.as_str()).bind(up_to);
     delete.execute(&mut *connection).await?;

@@ -150,8 +150,7 @@ trait AsyncWork<T>: Send {
 
 async fn once<T>(connection: &mut PgConnection, site_id: &SiteId, work: &mut impl AsyncWork<T>) -> Result<T, Undone> {
     let statements = async {
-        sqlx::raw_sql("BEGIN").execute(&mut *connection).await?;
-        let head = write_sql::lock_head(connection, site_id).await?;
+        let head = write_sql::begin(connection, site_id).await?;
         work.run(connection, site_id, head).await
     };
     let (done, writes) =
@@ -198,10 +197,7 @@ impl AsyncWork<(Vec<Results>, Seq)> for GroupCommit {
         group.seal();
         let writes = group.writes();
         if writes {
-            write_sql::rows(connection, site_id, &group.rows).await?;
-            write_sql::entries(connection, site_id, &group.entries).await?;
-            write_sql::grow(connection, site_id, &group).await?;
-            write_sql::head(connection, site_id, group.head).await?;
+            write_sql::write_group(connection, site_id, &group).await?;
         }
         Ok(((results, group.head), writes))
     }

@@ -172,7 +172,7 @@ impl SqliteRestored {
     pub fn amend(mut self, item: &Item) -> Boxed<'_, Result<(), OpenError>> {
         Box::pin(async move {
             let mut transaction = self.connection.begin().await.map_err(amending)?;
-            write_sql::rows(&mut transaction, &self.site_id, &amended(item)).await.map_err(amending)?;
+            write_sql::write_rows(&mut transaction, &self.site_id, &amended(item)).await.map_err(amending)?;
             transaction.commit().await.map_err(amending)?;
             self.connection.close().await.map_err(amending)
         })

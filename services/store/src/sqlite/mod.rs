@@ -4,6 +4,7 @@
 //! writer task is the only writer of the file, which is why it may judge items by what it remembers.
 //! SQL stays within what PostgreSQL also has: numbered binds, `ON CONFLICT … DO UPDATE`, BIGINT and TEXT.
 
+mod batch;
 mod copy;
 mod file;
 mod frames;

@@ -1,24 +1,15 @@
-//! The statements of the writer: many rows each, because every statement costs a hop to SQLite's thread and back.
+//! The statements of the writer.
 //!
-//! Invariant: only table and column names from closed lists are ever spliced into text; every value is bound.
-//!
-//! Multi-row statements use plain `?`: SQLite finds a numbered name by walking all names, so that thousands of `$n` would cost a
-//! square. An engine that needs numbers writes them in [`placeholders`].
+//! Invariant: as [`super::batch`].
 
+use super::batch::{Batch, columns};
 use crate::audit::{self, Heads};
-use crate::group::{CurrentRevision, Group};
-use crate::sql::{self, ENTRY_COLUMNS, ROW_COLUMNS, ROW_CONFLICT, ord};
+use crate::group::{CurrentRevision, Group, sort_by_log, sort_by_table};
+use crate::sql::{self, ENTRY_COLUMNS, MOVE_AUDIT_HEAD, MOVED_AUDIT_HEAD, ROW_COLUMNS, ROW_CONFLICT, ord};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Revision, Row, Seq, Table};
-use sqlx::sqlite::SqliteArguments;
-use sqlx::{AssertSqlSafe, Row as _, Sqlite, SqliteConnection, query::Query};
+use sqlx::{AssertSqlSafe, Error, Row as _, SqliteConnection};
 use std::collections::{BTreeMap, HashMap};
-use std::sync::Arc;
-
-/// Rows of the largest statement. Sizes are powers of two up to this, so that the prepared ones are few and found again.
-const ROWS_PER_STATEMENT: usize = 128;
-
-type Statement<'q> = Query<'q, Sqlite, SqliteArguments>;
 
 /// `rows` tuples of `columns` placeholders.
 pub(super) fn placeholders(rows: usize, columns: usize) -> String {
@@ -26,137 +17,101 @@ pub(super) fn placeholders(rows: usize, columns: usize) -> String {
     vec![tuple; rows].join(", ")
 }
 
-/// Cuts a slice into statements' worth.
-fn statements<T>(mut rest: &[T]) -> impl Iterator<Item = &[T]> {
-    std::iter::from_fn(move || {
-        let size = ROWS_PER_STATEMENT.min(1 << rest.len().checked_ilog2()?);
-        let (now, later) = rest.split_at(size);
-        rest = later;
-        Some(now)
-    })
-}
-
-fn prepared<'q>(sql: String) -> Statement<'q> {
-    sqlx::query(AssertSqlSafe(sql))
-}
-
-/// Writes what a group leaves of its rows.
-pub(super) async fn rows(
-    connection: &mut SqliteConnection,
-    site_id: &SiteId,
-    rows: &BTreeMap<Key, Option<Row>>,
-) -> Result<(), sqlx::Error> {
-    let mut put: BTreeMap<Table, Vec<&Row>> = BTreeMap::new();
-    let mut gone: BTreeMap<Table, Vec<&Arc<str>>> = BTreeMap::new();
-    for (key, row) in rows {
-        match row {
-            Some(row) => put.entry(key.table).or_default().push(row),
-            None => gone.entry(key.table).or_default().push(&key.id),
-        }
-    }
-    for (table, rows) in put {
-        for slice in statements(&rows) {
-            upsert(table, site_id, slice).execute(&mut *connection).await?;
-        }
-    }
-    for (table, ids) in gone {
-        for slice in statements(&ids) {
-            let ids = placeholders(1, slice.len());
-            let mut delete = prepared(format!("DELETE FROM {} WHERE site_id = ? AND id IN {ids}", table.name()))
-                .bind(site_id.as_str());
-            for id in slice {
-                delete = delete.bind(Arc::clone(id));
-            }
-            delete.execute(&mut *connection).await?;
-        }
-    }
-    Ok(())
-}
-
-fn upsert<'q>(table: Table, site_id: &'q SiteId, rows: &[&Row]) -> Statement<'q> {
-    let mut statement = prepared(format!(
-        "INSERT INTO {} ({ROW_COLUMNS}) VALUES {} {ROW_CONFLICT}",
-        table.name(),
-        placeholders(rows.len(), 7),
-    ));
-    for row in rows {
-        statement = statement
-            .bind(site_id.as_str())
-            .bind(row.key.id.clone())
-            .bind(row.revision.0.cast_signed())
-            .bind(row.index.state)
-            .bind(row.index.parent.clone())
-            .bind(ord(row.index.order))
-            .bind(row.body.clone());
-    }
-    statement
-}
-
-/// Appends a group's entries to their logs.
-pub(super) async fn entries(
-    connection: &mut SqliteConnection,
-    site_id: &SiteId,
-    entries: &[Entry],
-) -> Result<(), sqlx::Error> {
-    for log in Log::ALL {
-        let of_log: Vec<&Entry> = entries.iter().filter(|e| e.log == log).collect();
-        for slice in statements(&of_log) {
-            append(log, site_id, slice).execute(&mut *connection).await?;
-        }
-    }
-    Ok(())
-}
-
-fn append<'q>(log: Log, site_id: &'q SiteId, entries: &[&Entry]) -> Statement<'q> {
-    let values = placeholders(entries.len(), 13);
-    let mut statement = prepared(format!("INSERT INTO {} ({ENTRY_COLUMNS}) VALUES {values}", log.name()));
-    for entry in entries {
-        statement = statement
-            .bind(site_id.as_str())
-            .bind(entry.seq.0.cast_signed())
-            .bind(entry.table.map(Table::name))
-            .bind(entry.subject.clone())
-            .bind(entry.revision.0.cast_signed())
-            .bind(entry.index.state)
-            .bind(entry.index.parent.clone())
-            .bind(entry.index.order)
-            .bind(entry.body.clone())
-            .bind(entry.kind.clone())
-            .bind(entry.actor.clone())
-            .bind(entry.request_id.clone())
-            .bind(entry.at_unix_ms);
-    }
-    statement
-}
-
-/// Where the chains of the audit stand.
-pub(super) async fn chains(connection: &mut SqliteConnection, site_id: &SiteId) -> Result<Heads, sqlx::Error> {
-    let rows = prepared(audit::select_heads()).bind(site_id.as_str()).fetch_all(connection).await?;
-    audit::heads(&rows)
-}
-
-/// Moves the heads of the chains that grew, and takes what was cut.
-pub(super) async fn grow(
+/// All that a group leaves, up to its COMMIT.
+pub(super) async fn write_group(
     connection: &mut SqliteConnection,
     site_id: &SiteId,
     group: &Group,
-) -> Result<(), sqlx::Error> {
-    for writer in &group.audited_writers {
-        let head = group.chains.get(writer).cloned().unwrap_or_default();
-        let upsert = sqlx::query(sql::MOVE_AUDIT_HEAD).bind(site_id.as_str()).bind(writer.as_str());
-        upsert.bind(head.n.cast_signed()).bind(head.hash).execute(&mut *connection).await?;
+) -> Result<(), Error> {
+    let mut batch = Batch::default();
+    batch.push("BEGIN IMMEDIATE");
+    add_rows(&mut batch, site_id, &group.rows)?;
+    add_entries(&mut batch, site_id, &group.entries)?;
+    add_audit(&mut batch, site_id, group)?;
+    batch.push(sql::MOVE_HEAD).bind_number(group.head.0.cast_signed())?.bind(site_id.as_str())?;
+    batch.run(connection).await
+}
+
+/// Writes rows alone.
+pub(super) async fn write_rows(
+    connection: &mut SqliteConnection,
+    site_id: &SiteId,
+    rows: &BTreeMap<Key, Option<Row>>,
+) -> Result<(), Error> {
+    let mut batch = Batch::default();
+    add_rows(&mut batch, site_id, rows)?;
+    batch.run(connection).await
+}
+
+fn add_rows(batch: &mut Batch, site_id: &SiteId, rows: &BTreeMap<Key, Option<Row>>) -> Result<(), Error> {
+    let (put, gone) = sort_by_table(rows);
+    for (table, rows) in put {
+        let values = |row: &Row| {
+            let index = &row.index;
+            let parent = index.parent.clone();
+            (row.key.id.clone(), row.revision.0.cast_signed(), index.state, parent, ord(index.order), row.body.clone())
+        };
+        // SQLite cannot tell ON CONFLICT from a join without a WHERE before it.
+        let upsert = format!(
+            "INSERT INTO {} ({ROW_COLUMNS}) SELECT ?, {} FROM json_each(?) WHERE true {ROW_CONFLICT}",
+            table.name(),
+            columns(6),
+        );
+        batch.push(&upsert).bind(site_id.as_str())?.bind_rows(rows.into_iter().map(values))?;
     }
-    for (table, up_to) in &group.cuts {
-        let delete = prepared(sql::cut(*table)).bind(site_id.as_str()).bind(up_to.cast_signed());
-        delete.execute(&mut *connection).await?;
+    for (table, ids) in gone {
+        let delete =
+            format!("DELETE FROM {} WHERE site_id = ? AND id IN (SELECT value FROM json_each(?))", table.name());
+        batch.push(&delete).bind(site_id.as_str())?.bind_rows(ids)?;
     }
     Ok(())
 }
 
-/// Moves the head row.
-pub(super) async fn head(connection: &mut SqliteConnection, site_id: &SiteId, head: Seq) -> Result<(), sqlx::Error> {
-    sqlx::query(sql::MOVE_HEAD).bind(head.0.cast_signed()).bind(site_id.as_str()).execute(connection).await?;
+fn add_entries(batch: &mut Batch, site_id: &SiteId, entries: &[Entry]) -> Result<(), Error> {
+    for (log, entries) in sort_by_log(entries) {
+        let values = |entry: &Entry| {
+            (
+                entry.seq.0.cast_signed(),
+                entry.table.map(Table::name),
+                entry.subject.clone(),
+                entry.revision.0.cast_signed(),
+                entry.index.state,
+                entry.index.parent.clone(),
+                entry.index.order,
+                entry.body.clone(),
+                entry.kind.clone(),
+                entry.actor.clone(),
+                entry.request_id.clone(),
+                entry.at_unix_ms,
+            )
+        };
+        let append =
+            format!("INSERT INTO {} ({ENTRY_COLUMNS}) SELECT ?, {} FROM json_each(?)", log.name(), columns(12),);
+        batch.push(&append).bind(site_id.as_str())?.bind_rows(entries.into_iter().map(values))?;
+    }
     Ok(())
+}
+
+/// Moves the heads of the chains that grew, and takes what was cut.
+fn add_audit(batch: &mut Batch, site_id: &SiteId, group: &Group) -> Result<(), Error> {
+    for writer in &group.audited_writers {
+        let head = group.chains.get(writer).cloned().unwrap_or_default();
+        batch
+            .push(&format!("{MOVE_AUDIT_HEAD} (?, ?, ?, ?) {MOVED_AUDIT_HEAD}"))
+            .bind(site_id.as_str())?
+            .bind(writer.as_str())?;
+        batch.bind_number(head.n.cast_signed())?.bind(&head.hash)?;
+    }
+    for (table, up_to) in &group.cuts {
+        batch.push(&sql::cut(*table)).bind(site_id.as_str())?.bind_number(up_to.cast_signed())?;
+    }
+    Ok(())
+}
+
+/// Where the chains of the audit stand.
+pub(super) async fn chains(connection: &mut SqliteConnection, site_id: &SiteId) -> Result<Heads, Error> {
+    let select = sqlx::query(AssertSqlSafe(audit::select_heads())).bind(site_id.as_str());
+    audit::heads(&select.fetch_all(connection).await?)
 }
 
 /// Where some rows of the file stand. Every key asked for is in the answer.
@@ -164,26 +119,26 @@ pub(super) async fn read_current_revisions(
     connection: &mut SqliteConnection,
     site_id: &SiteId,
     keys: Vec<Key>,
-) -> Result<HashMap<Key, CurrentRevision>, sqlx::Error> {
-    let mut ids: BTreeMap<Table, Vec<Arc<str>>> = BTreeMap::new();
+) -> Result<HashMap<Key, CurrentRevision>, Error> {
+    let mut ids: BTreeMap<Table, Vec<&str>> = BTreeMap::new();
     for key in &keys {
-        ids.entry(key.table).or_default().push(key.id.clone());
+        ids.entry(key.table).or_default().push(&key.id);
     }
-    let mut found: HashMap<Key, CurrentRevision> = keys.into_iter().map(|key| (key, None)).collect();
-    for (table, ids) in ids {
-        for slice in statements(&ids) {
-            let list = placeholders(1, slice.len());
-            let mut select =
-                prepared(format!("SELECT id, revision FROM {} WHERE site_id = ? AND id IN {list}", table.name()))
-                    .bind(site_id.as_str());
-            for id in slice {
-                select = select.bind(id.clone());
-            }
-            for row in select.fetch_all(&mut *connection).await? {
-                let revision = Revision(row.try_get::<i64, _>(1)?.cast_unsigned());
-                found.insert(Key::new(table, row.try_get::<&str, _>(0)?), Some(revision));
-            }
-        }
+    let mut batch = Batch::default();
+    for (table, ids) in &ids {
+        let name = table.name();
+        let select = format!(
+            "SELECT '{name}', id, revision FROM {name} WHERE site_id = ? AND id IN (SELECT value FROM json_each(?))"
+        );
+        batch.push(&select).bind(site_id.as_str())?.bind_rows(ids.iter())?;
+    }
+    let rows = batch.fetch(connection).await?;
+    let mut found: HashMap<Key, CurrentRevision> = keys.iter().map(|key| (key.clone(), None)).collect();
+    for row in rows {
+        let name: &str = row.try_get(0)?;
+        let Some(table) = ids.keys().find(|table| table.name() == name) else { continue };
+        let revision = Revision(row.try_get::<i64, _>(2)?.cast_unsigned());
+        found.insert(Key::new(*table, row.try_get::<&str, _>(1)?), Some(revision));
     }
     Ok(found)
 }
@@ -194,9 +149,12 @@ pub(super) async fn prune(
     site_id: &SiteId,
     log: Log,
     up_to: Seq,
-) -> Result<(), sqlx::Error> {
+) -> Result<(), Error> {
     let up_to = up_to.0.cast_signed();
-    prepared(sql::prune(log)).bind(site_id.as_str()).bind(up_to).execute(&mut *connection).await?;
-    sqlx::query(sql::MARK_LOG).bind(site_id.as_str()).bind(log.name()).bind(up_to).execute(connection).await?;
-    Ok(())
+    let mut batch = Batch::default();
+    batch.push("BEGIN IMMEDIATE");
+    batch.push(&sql::prune(log)).bind(site_id.as_str())?.bind_number(up_to)?;
+    batch.push(sql::MARK_LOG).bind(site_id.as_str())?.bind(log.name())?.bind_number(up_to)?;
+    batch.push("COMMIT");
+    batch.run(connection).await
 }

@@ -177,24 +177,14 @@ impl Engine for Writer {
     async fn prune(&mut self, log: Log, up_to: Seq) -> Result<(), Error> {
         self.connect().await.map_err(Error::Unavailable)?;
         let connection = self.connection.as_mut().ok_or_else(|| Error::Unavailable(closed()))?;
-        let slice = async {
-            let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
-            write_sql::prune(&mut transaction, &self.site_id, log, up_to).await?;
-            transaction.commit().await
-        };
-        slice.await.map_err(|error| Error::Unavailable(self.fail(error)))
+        let pruned = write_sql::prune(connection, &self.site_id, log, up_to).await;
+        pruned.map_err(|error| Error::Unavailable(self.fail(error)))
     }
 }
 
 async fn transaction(connection: &mut SqliteConnection, site_id: &SiteId, group: &Group) -> Result<(), Failed> {
-    let statements = async {
-        sqlx::query("BEGIN IMMEDIATE").execute(&mut *connection).await?;
-        write_sql::rows(connection, site_id, &group.rows).await?;
-        write_sql::entries(connection, site_id, &group.entries).await?;
-        write_sql::grow(connection, site_id, group).await?;
-        write_sql::head(connection, site_id, group.head).await
-    };
-    statements.await.map_err(|error| Failed::Before(Arc::new(error)))?;
+    let written = write_sql::write_group(connection, site_id, group).await;
+    written.map_err(|error| Failed::Before(Arc::new(error)))?;
     sqlx::query("COMMIT").execute(connection).await.map(drop).map_err(|error| Failed::AtCommit(Arc::new(error)))
 }
 

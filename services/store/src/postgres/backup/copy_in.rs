@@ -136,7 +136,7 @@ impl PostgresRestore {
     /// The database.
     pub fn amend<'a>(&'a mut self, site_id: &'a SiteId, item: &'a Item) -> Boxed<'a, Result<(), RestoreError>> {
         Box::pin(async move {
-            in_time(write_sql::rows(&mut self.connection, site_id, &amended(item))).await.map_err(failed)
+            in_time(write_sql::write_rows(&mut self.connection, site_id, &amended(item))).await.map_err(failed)
         })
     }
 
