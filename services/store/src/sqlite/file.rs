@@ -24,7 +24,7 @@ const LOCK_PAUSE: Duration = Duration::from_millis(20);
 /// Longer than any checkpoint; only a checkpoint ever makes the writer wait.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(30);
 /// Texts of groups: a text for each set of tables and logs that one group writes.
-const STATEMENTS_CACHED: usize = 512;
+const STATEMENTS_CACHED: usize = 128;
 /// Read connections: a list, a snapshot and two feeds at once; more only share the disk.
 const READERS: u32 = 4;
 /// Pause between checkpoints.
