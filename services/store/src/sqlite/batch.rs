@@ -5,13 +5,30 @@
 
 use serde::Serialize;
 use sqlx::sqlite::{SqliteArguments, SqliteRow};
-use sqlx::{Arguments, AssertSqlSafe, Error, SqliteConnection};
+use sqlx::{Arguments, AssertSqlSafe, Either, Error, Executor, SqliteConnection};
+use std::pin::pin;
+use std::sync::Arc;
+use std::task::{Context, Poll, Waker};
+use std::time::Duration;
+use tokio::sync::Notify;
+use tokio_stream::{Stream, StreamExt};
+
+/// When a transaction is looked at of which no word has come that its COMMIT began.
+const LOOK_AFTER: Duration = Duration::from_millis(10);
 
 /// Statements with their values, in order.
 #[derive(Default)]
 pub(super) struct Batch {
     sql: String,
     values: SqliteArguments,
+    statements: usize,
+}
+
+/// Why a transaction did not go through.
+pub(super) struct Stopped {
+    /// Whether all before its COMMIT was done: then nobody knows.
+    pub(super) at_commit: bool,
+    pub(super) error: Error,
 }
 
 impl Batch {
@@ -24,6 +41,7 @@ impl Batch {
             self.sql.push_str(part.trim_start_matches(|c: char| c.is_ascii_digit()));
         }
         self.sql.push(';');
+        self.statements += 1;
         self
     }
 
@@ -50,10 +68,53 @@ impl Batch {
         sqlx::query_with(AssertSqlSafe(self.sql), self.values).execute(connection).await.map(drop)
     }
 
+    /// Runs a transaction, of which COMMIT is the last statement. Each statement has a result, and whoever waits for it is woken by each: so nobody
+    /// waits until `committing` says that only the disk is missing.
+    pub(super) async fn run_transaction(
+        mut self,
+        connection: &mut SqliteConnection,
+        committing: &Notify,
+    ) -> Result<(), Stopped> {
+        self.push("COMMIT");
+        let (statements, mut done) = (self.statements, 0);
+        let query = sqlx::query_with(AssertSqlSafe(self.sql), self.values);
+        let mut results = pin!(connection.fetch_many(query));
+        let mut is_looking = false;
+        while done < statements {
+            let polled = results.as_mut().poll_next(&mut Context::from_waker(Waker::noop()));
+            let result = match polled {
+                Poll::Ready(result) => result,
+                Poll::Pending if is_looking => results.next().await,
+                Poll::Pending => {
+                    drop(tokio::time::timeout(LOOK_AFTER, committing.notified()).await);
+                    is_looking = true;
+                    continue;
+                }
+            };
+            match result.unwrap_or(Err(Error::WorkerCrashed)) {
+                Ok(Either::Left(_)) => done += 1,
+                Ok(Either::Right(_)) => {}
+                Err(error) => return Err(Stopped { at_commit: done + 1 == statements, error }),
+            }
+        }
+        Ok(())
+    }
+
     /// Runs all of it, and answers with the rows of every statement.
     pub(super) async fn fetch(self, connection: &mut SqliteConnection) -> Result<Vec<SqliteRow>, Error> {
         sqlx::query_with(AssertSqlSafe(self.sql), self.values).fetch_all(connection).await
     }
+}
+
+/// Tells when a COMMIT of the connection begins.
+pub(super) async fn tell_commits(connection: &mut SqliteConnection) -> Result<Arc<Notify>, Error> {
+    let told = Arc::new(Notify::new());
+    let tell = told.clone();
+    connection.lock_handle().await?.set_commit_hook(move || {
+        tell.notify_one();
+        true
+    });
+    Ok(told)
 }
 
 /// The first columns of a row of `json_each`.

@@ -78,11 +78,15 @@ impl SqliteStore {
             let head = writer::head(&mut connection, &site_id)
                 .await
                 .map_err(|source| OpenError::Sql { doing: "reading the head", source })?;
+            let committing = batch::tell_commits(&mut connection)
+                .await
+                .map_err(|source| OpenError::Sql { doing: "listening for commits", source })?;
             let readers = file.readers().await?;
             let tail = Arc::new(Tail::new(head));
             let (wake_sender, wake) = watch::channel(head);
             let (ended_sender, ended) = oneshot::channel();
             let (commands, queue) = Queue::new();
+            let connection = (connection, committing);
             let writer = Writer::new(file.clone(), connection, site_id.clone(), clock, tail.clone(), wake_sender, head);
             tokio::spawn(async move {
                 run(writer, queue).await;

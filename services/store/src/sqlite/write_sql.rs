@@ -3,13 +3,19 @@
 //! Invariant: as [`super::batch`].
 
 use super::batch::{Batch, columns};
+use super::revisions::{Revisions, Standing};
 use crate::audit::{self, Heads};
-use crate::group::{CurrentRevision, Group, sort_by_log, sort_by_table};
+use crate::group::{Group, sort_by_log, sort_by_table};
 use crate::sql::{self, ENTRY_COLUMNS, MOVE_AUDIT_HEAD, MOVED_AUDIT_HEAD, ROW_COLUMNS, ROW_CONFLICT, ord};
 use midshift_core::ids::SiteId;
-use midshift_core::rows::{Entry, Key, Log, Revision, Row, Seq, Table};
+use midshift_core::rows::{Entry, Key, Log, Row, Seq, Table};
 use sqlx::{AssertSqlSafe, Error, Row as _, SqliteConnection};
 use std::collections::{BTreeMap, HashMap};
+
+/// What an upsert does with rows that are there and stay where they are in every index: SQLite writes an index anew if one of its columns is named,
+/// whether or not it changes.
+const BODY_CONFLICT: &str =
+    "ON CONFLICT (site_id, id) DO UPDATE SET revision = excluded.revision, body = excluded.body";
 
 /// `rows` tuples of `columns` placeholders.
 pub(super) fn placeholders(rows: usize, columns: usize) -> String {
@@ -17,19 +23,15 @@ pub(super) fn placeholders(rows: usize, columns: usize) -> String {
     vec![tuple; rows].join(", ")
 }
 
-/// All that a group leaves, up to its COMMIT.
-pub(super) async fn write_group(
-    connection: &mut SqliteConnection,
-    site_id: &SiteId,
-    group: &Group,
-) -> Result<(), Error> {
+/// The transaction of a group, up to its COMMIT. `before`: where its rows stand.
+pub(super) fn write_group(site_id: &SiteId, group: &Group, before: &Revisions) -> Result<Batch, Error> {
     let mut batch = Batch::default();
     batch.push("BEGIN IMMEDIATE");
-    add_rows(&mut batch, site_id, &group.rows)?;
+    add_rows(&mut batch, site_id, &group.rows, before)?;
     add_entries(&mut batch, site_id, &group.entries)?;
     add_audit(&mut batch, site_id, group)?;
     batch.push(sql::MOVE_HEAD).bind_number(group.head.0.cast_signed())?.bind(site_id.as_str())?;
-    batch.run(connection).await
+    Ok(batch)
 }
 
 /// Writes rows alone.
@@ -39,31 +41,46 @@ pub(super) async fn write_rows(
     rows: &BTreeMap<Key, Option<Row>>,
 ) -> Result<(), Error> {
     let mut batch = Batch::default();
-    add_rows(&mut batch, site_id, rows)?;
+    add_rows(&mut batch, site_id, rows, &Revisions::default())?;
     batch.run(connection).await
 }
 
-fn add_rows(batch: &mut Batch, site_id: &SiteId, rows: &BTreeMap<Key, Option<Row>>) -> Result<(), Error> {
+fn add_rows(
+    batch: &mut Batch,
+    site_id: &SiteId,
+    rows: &BTreeMap<Key, Option<Row>>,
+    before: &Revisions,
+) -> Result<(), Error> {
     let (put, gone) = sort_by_table(rows);
     for (table, rows) in put {
-        let values = |row: &Row| {
-            let index = &row.index;
-            let parent = index.parent.clone();
-            (row.key.id.clone(), row.revision.0.cast_signed(), index.state, parent, ord(index.order), row.body.clone())
-        };
-        // SQLite cannot tell ON CONFLICT from a join without a WHERE before it.
-        let upsert = format!(
-            "INSERT INTO {} ({ROW_COLUMNS}) SELECT ?, {} FROM json_each(?) WHERE true {ROW_CONFLICT}",
-            table.name(),
-            columns(6),
-        );
-        batch.push(&upsert).bind(site_id.as_str())?.bind_rows(rows.into_iter().map(values))?;
+        let (stay, moved): (Vec<_>, Vec<_>) = rows.into_iter().partition(|row| before.has_index(row));
+        add_upsert(batch, site_id, table, stay, BODY_CONFLICT)?;
+        add_upsert(batch, site_id, table, moved, ROW_CONFLICT)?;
     }
     for (table, ids) in gone {
         let delete =
             format!("DELETE FROM {} WHERE site_id = ? AND id IN (SELECT value FROM json_each(?))", table.name());
         batch.push(&delete).bind(site_id.as_str())?.bind_rows(ids)?;
     }
+    Ok(())
+}
+
+fn add_upsert(batch: &mut Batch, site_id: &SiteId, table: Table, rows: Vec<&Row>, conflict: &str) -> Result<(), Error> {
+    if rows.is_empty() {
+        return Ok(());
+    }
+    let values = |row: &Row| {
+        let index = &row.index;
+        let parent = index.parent.clone();
+        (row.key.id.clone(), row.revision.0.cast_signed(), index.state, parent, ord(index.order), row.body.clone())
+    };
+    // SQLite cannot tell ON CONFLICT from a join without a WHERE before it.
+    let upsert = format!(
+        "INSERT INTO {} ({ROW_COLUMNS}) SELECT ?, {} FROM json_each(?) WHERE true {conflict}",
+        table.name(),
+        columns(6),
+    );
+    batch.push(&upsert).bind(site_id.as_str())?.bind_rows(rows.into_iter().map(values))?;
     Ok(())
 }
 
@@ -115,30 +132,35 @@ pub(super) async fn chains(connection: &mut SqliteConnection, site_id: &SiteId) 
 }
 
 /// Where some rows of the file stand. Every key asked for is in the answer.
-pub(super) async fn read_current_revisions(
+pub(super) async fn read_standings(
     connection: &mut SqliteConnection,
     site_id: &SiteId,
     keys: Vec<Key>,
-) -> Result<HashMap<Key, CurrentRevision>, Error> {
+) -> Result<HashMap<Key, Standing>, Error> {
     let mut ids: BTreeMap<Table, Vec<&str>> = BTreeMap::new();
     for key in &keys {
         ids.entry(key.table).or_default().push(&key.id);
     }
-    let mut batch = Batch::default();
-    for (table, ids) in &ids {
+    // The table's name stands where the body would.
+    let select = |table: &Table| {
         let name = table.name();
-        let select = format!(
-            "SELECT '{name}', id, revision FROM {name} WHERE site_id = ? AND id IN (SELECT value FROM json_each(?))"
-        );
-        batch.push(&select).bind(site_id.as_str())?.bind_rows(ids.iter())?;
+        format!(
+            "SELECT id, revision, state, parent, ord, '{name}' FROM {name} \
+             WHERE site_id = ? AND id IN (SELECT value FROM json_each(?))"
+        )
+    };
+    let mut batch = Batch::default();
+    batch.push(&ids.keys().map(select).collect::<Vec<_>>().join(" UNION ALL "));
+    for ids in ids.values() {
+        batch.bind(site_id.as_str())?.bind_rows(ids.iter())?;
     }
     let rows = batch.fetch(connection).await?;
-    let mut found: HashMap<Key, CurrentRevision> = keys.iter().map(|key| (key.clone(), None)).collect();
+    let mut found: HashMap<Key, Standing> = keys.iter().map(|key| (key.clone(), None)).collect();
     for row in rows {
-        let name: &str = row.try_get(0)?;
+        let name: &str = row.try_get(5)?;
         let Some(table) = ids.keys().find(|table| table.name() == name) else { continue };
-        let revision = Revision(row.try_get::<i64, _>(2)?.cast_unsigned());
-        found.insert(Key::new(*table, row.try_get::<&str, _>(1)?), Some(revision));
+        let row = sql::row(*table, &row)?;
+        found.insert(row.key, Some((row.revision, row.index)));
     }
     Ok(found)
 }

@@ -4,6 +4,7 @@
 //! "applied" before the COMMIT that holds it has returned. An error at COMMIT is answered `Unknown` to every member of the group,
 //! and nothing remembered from before it is used again.
 
+use super::batch::{Stopped, tell_commits};
 use super::file::DataFile;
 use super::revisions::Revisions;
 use super::tail::Tail;
@@ -19,12 +20,14 @@ use midshift_core::time::{Clock, Utc};
 use sqlx::{Connection, Row, SqliteConnection};
 use std::collections::HashMap;
 use std::sync::Arc;
-use tokio::sync::watch;
+use tokio::sync::{Notify, watch};
 
 pub(super) struct Writer {
     file: DataFile,
     /// None after a failure, until the next command.
     connection: Option<SqliteConnection>,
+    /// Told when a COMMIT of the connection begins.
+    committing: Arc<Notify>,
     site_id: SiteId,
     clock: Arc<dyn Clock>,
     revisions: Revisions,
@@ -38,7 +41,7 @@ pub(super) struct Writer {
 impl Writer {
     pub(super) fn new(
         file: DataFile,
-        connection: SqliteConnection,
+        (connection, committing): (SqliteConnection, Arc<Notify>),
         site_id: SiteId,
         clock: Arc<dyn Clock>,
         tail: Arc<Tail>,
@@ -46,7 +49,7 @@ impl Writer {
         head: Seq,
     ) -> Self {
         let (connection, revisions, chains) = (Some(connection), Revisions::default(), None);
-        Self { file, connection, site_id, clock, revisions, tail, wake, head, chains }
+        Self { file, connection, committing, site_id, clock, revisions, tail, wake, head, chains }
     }
 
     /// A group that knows where all rows stand that its items name.
@@ -66,11 +69,11 @@ impl Writer {
         }
         if !missing.is_empty() {
             let connection = self.connection.as_mut().ok_or_else(closed)?;
-            let found = write_sql::read_current_revisions(connection, &self.site_id, missing).await;
+            let found = write_sql::read_standings(connection, &self.site_id, missing).await;
             let found = found.map_err(|error| self.fail(error))?;
-            for (key, revision) in found {
-                self.revisions.note(key.clone(), revision);
-                base.insert(key, revision);
+            for (key, standing) in found {
+                base.insert(key.clone(), standing.as_ref().map(|(revision, _)| *revision));
+                self.revisions.note(key, standing);
             }
         }
         let is_audited = items.iter().flatten().any(|item| item.note.is_some());
@@ -100,6 +103,7 @@ impl Writer {
             return Ok(());
         }
         let mut connection = self.file.writer().await.map_err(|e| -> Cause { Arc::new(e) })?;
+        self.committing = tell_commits(&mut connection).await.map_err(|e| -> Cause { Arc::new(e) })?;
         let head = head(&mut connection, &self.site_id).await.map_err(|e| -> Cause { Arc::new(e) })?;
         self.revisions.forget_all();
         self.chains = None;
@@ -114,14 +118,21 @@ impl Writer {
         let Some(connection) = self.connection.as_mut() else {
             return Err(Failed::Before(closed()));
         };
-        let outcome = transaction(connection, &self.site_id, group).await;
+        let batch = write_sql::write_group(&self.site_id, group, &self.revisions);
+        let outcome = match batch {
+            Ok(batch) => batch.run_transaction(connection, &self.committing).await,
+            Err(error) => Err(Stopped { at_commit: false, error }),
+        };
         if outcome.is_err() {
             // Dropping the connection rolls back what it had open.
             self.connection = None;
             self.revisions.forget_all();
             self.chains = None;
         }
-        outcome
+        outcome.map_err(|Stopped { at_commit, error }| match at_commit {
+            true => Failed::AtCommit(Arc::new(error)),
+            false => Failed::Before(Arc::new(error)),
+        })
     }
 
     /// After the commit: what was written is known, then readable at the head, then announced.
@@ -130,7 +141,7 @@ impl Writer {
             self.chains = Some(group.chains);
         }
         for (key, row) in group.rows {
-            self.revisions.note(key, row.map(|row| row.revision));
+            self.revisions.note(key, row.map(|row| (row.revision, row.index)));
         }
         if group.head > self.head {
             self.head = group.head;
@@ -180,12 +191,6 @@ impl Engine for Writer {
         let pruned = write_sql::prune(connection, &self.site_id, log, up_to).await;
         pruned.map_err(|error| Error::Unavailable(self.fail(error)))
     }
-}
-
-async fn transaction(connection: &mut SqliteConnection, site_id: &SiteId, group: &Group) -> Result<(), Failed> {
-    let written = write_sql::write_group(connection, site_id, group).await;
-    written.map_err(|error| Failed::Before(Arc::new(error)))?;
-    sqlx::query("COMMIT").execute(connection).await.map(drop).map_err(|error| Failed::AtCommit(Arc::new(error)))
 }
 
 /// The newest number given.
