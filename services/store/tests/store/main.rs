@@ -19,5 +19,9 @@ mod reopen;
 #[expect(dead_code, reason = "other crates' tests use the rest of it")]
 #[path = "../../../../tests/src/postgres.rs"]
 mod server;
+#[expect(dead_code, reason = "other crates' tests use the rest of it")]
+#[path = "../../../../tests/src/strace.rs"]
+mod strace;
 mod support;
+mod synced;
 mod turns;
