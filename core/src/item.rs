@@ -165,6 +165,12 @@ impl Item {
             || self.facts.len() > limits::ITEM_ROWS_MAX
             || self.bytes() > limits::GROUP_COMMIT_BYTES
     }
+    /// Whether its marks leave entries. How far a service has read concerns nobody else, and the service reads it from the row: a mark leaves an entry
+    /// where nothing else of the item does, so that whoever waits for it is woken.
+    pub fn tells_marks(&self) -> bool {
+        let is_told = |row: &RowChange| !matches!(row.write, Write::Keep) && !row.key.table.is_mark();
+        self.facts.is_empty() && !self.rows.iter().any(is_told)
+    }
     /// Whether it would change anything.
     pub fn is_empty(&self) -> bool {
         self.note.is_none() && self.facts.is_empty() && self.rows.iter().all(|r| matches!(r.write, Write::Keep))

@@ -149,6 +149,10 @@ impl Table {
     pub fn audit_named(service: &str) -> Option<Self> {
         AUDITS.iter().find(|(of, _)| of.as_str() == service).map(|(_, table)| *table)
     }
+    /// Whether its rows say how far a service has read.
+    pub const fn is_mark(self) -> bool {
+        matches!(self, Self::FleetMark | Self::OtaMark)
+    }
     /// Whether it is an audit, which only notes of items write.
     pub fn is_audit(self) -> bool {
         AUDITS.iter().any(|(_, table)| *table == self)

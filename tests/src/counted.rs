@@ -60,8 +60,8 @@ impl Store for Counted {
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {
         self.count(self.store.feed(after, logs, limit).await, |page| page.entries.len())
     }
-    async fn feed_of(&self, log: Log, subjects: &[Arc<str>], after: Seq, limit: usize) -> Result<FeedPage, Error> {
-        self.count(self.store.feed_of(log, subjects, after, limit).await, |page| page.entries.len())
+    async fn feed_of(&self, subjects: Subjects<'_>, after: Seq, limit: usize) -> Result<FeedPage, Error> {
+        self.count(self.store.feed_of(subjects, after, limit).await, |page| page.entries.len())
     }
     fn wake(&self) -> watch::Receiver<Seq> {
         self.store.wake()

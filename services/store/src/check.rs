@@ -103,6 +103,7 @@ pub(crate) fn decide(
 ) -> Result<Decided, CommitError> {
     form(&item)?;
     expectations(&item, found)?;
+    let tells_marks = item.tells_marks();
     let Item { writer, actor, token, request_id, rows, facts, note, silent: _ } = item;
     let by = Attribution { actor: actor.clone(), token, request_id: request_id.clone(), at_unix_ms };
     let audited = note.map(|note| Draft { writer, note, by });
@@ -135,8 +136,10 @@ pub(crate) fn decide(
             Write::Put { index, body } => (index, Some(body)),
             Write::Delete => (Index::default(), None),
         };
-        let entry = entry(seq, Log::of_writer(writer), key.id.clone(), kind, body.clone());
-        decided.entries.push(Entry { table: Some(key.table), revision, index: index.clone(), ..entry });
+        if tells_marks || !key.table.is_mark() {
+            let entry = entry(seq, Log::of_writer(writer), key.id.clone(), kind, body.clone());
+            decided.entries.push(Entry { table: Some(key.table), revision, index: index.clone(), ..entry });
+        }
         match body {
             Some(body) => {
                 decided.applied.revisions.push((key.clone(), revision));

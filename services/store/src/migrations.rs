@@ -112,6 +112,14 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0090_token_name",
     "0091_rollout_by_state",
     "0092_rollout_robot_by_state",
+    "0093_no_task_event_by_subject",
+    "0094_no_fleet_event_by_subject",
+    "0095_no_telemetry_event_by_subject",
+    "0096_no_ota_event_by_subject",
+    "0097_no_stop_event_by_subject",
+    "0098_no_identity_event_by_subject",
+    "0099_task_event_by_request_key",
+    "0100_fleet_event_by_attempt",
 ];
 
 /// Of `telemetry.db`.

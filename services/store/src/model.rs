@@ -135,8 +135,8 @@ impl State {
         self.tables.get(&key.table)?.get(&key.id)
     }
 
-    fn page(&self, after: Seq, logs: &[Log], limit: usize, keep: impl Fn(&Entry) -> bool) -> Result<FeedPage, Error> {
-        let logs: BTreeSet<usize> = logs.iter().map(|log| log_index(*log)).collect();
+    fn page(&self, after: Seq, wanted: &Wanted, limit: usize) -> Result<FeedPage, Error> {
+        let logs: BTreeSet<usize> = wanted.logs.iter().map(|log| log_index(*log)).collect();
         let oldest = logs.iter().map(|log| self.logs[*log].pruned).max().unwrap_or_default();
         if after < oldest || after > self.head {
             return Err(Error::CursorExpired { asked: after, oldest });
@@ -144,7 +144,7 @@ impl State {
         let limit = limit.clamp(1, FEED_PAGE_MAX);
         let mut entries: Vec<&Entry> = Vec::new();
         for log in logs {
-            entries.extend(self.logs[log].after(after).filter(|e| keep(e)).take(limit));
+            entries.extend(self.logs[log].after(after).filter(|e| wanted.holds(e)).take(limit));
         }
         entries.sort_unstable_by_key(|e| e.seq);
         entries.truncate(limit);
@@ -224,12 +224,11 @@ impl Store for MemoryStore {
     }
 
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {
-        self.state().page(after, logs, limit, |_| true)
+        self.state().page(after, &Wanted::from_logs(logs), limit)
     }
 
-    async fn feed_of(&self, log: Log, subjects: &[Arc<str>], after: Seq, limit: usize) -> Result<FeedPage, Error> {
-        let subjects: BTreeSet<&Arc<str>> = subjects.iter().collect();
-        self.state().page(after, &[log], limit, |entry| subjects.contains(&entry.subject))
+    async fn feed_of(&self, subjects: Subjects<'_>, after: Seq, limit: usize) -> Result<FeedPage, Error> {
+        self.state().page(after, &Wanted::from_subjects(subjects)?, limit)
     }
 
     fn wake(&self) -> watch::Receiver<Seq> {

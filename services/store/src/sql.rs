@@ -82,6 +82,11 @@ pub(crate) fn of_parent(table: Table) -> String {
     format!("SELECT {ROW_READ} FROM {} WHERE site_id = $1 AND parent = $2 ORDER BY ord, id", table.name())
 }
 
+/// What is asked of an entry beside its subject: in words, so that the index of such entries alone is used.
+pub(crate) fn of_table(table: Option<Table>) -> String {
+    table.map_or_else(String::new, |table| format!(" AND tbl = '{}'", table.name()))
+}
+
 /// How many entries a log holds.
 pub(crate) fn count(log: Log) -> String {
     format!("SELECT COUNT(*) FROM {} WHERE site_id = $1", log.name())

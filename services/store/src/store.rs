@@ -6,7 +6,7 @@ use midshift_core::ids::{RobotId, SiteId};
 use midshift_core::item::Item;
 use midshift_core::limits;
 use midshift_core::rows::{BadRow, Entry, Key, Log, Naming, Record, Revision, Row, RowSelection, Seq, Table, Writer};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::sync::Arc;
 use tokio::sync::watch;
@@ -282,8 +282,8 @@ pub trait Store: Send + Sync + 'static {
     /// # Errors
     /// [`Error::CursorExpired`] if entries after the cursor are gone, or the cursor is ahead of the store.
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error>;
-    /// Entries of one log about some subjects (robots of the inbox, row ids); like [`Store::feed`] otherwise.
-    async fn feed_of(&self, log: Log, subjects: &[Arc<str>], after: Seq, limit: usize) -> Result<FeedPage, Error>;
+    /// Entries about some subjects alone; like [`Store::feed`] otherwise.
+    async fn feed_of(&self, subjects: Subjects<'_>, after: Seq, limit: usize) -> Result<FeedPage, Error>;
     /// A hint: the newest number committed. May skip values, never the last one. Carries no data; read the feed.
     fn wake(&self) -> watch::Receiver<Seq>;
     /// Makes the next number higher than `at_least`: someone has seen a number that this store never gave (it was restored
@@ -293,6 +293,46 @@ pub trait Store: Send + Sync + 'static {
     async fn audit_heads(&self) -> Result<BTreeMap<Writer, Head>, Error>;
     /// Takes old entries out of the logs, in small slices that let commits pass. Returns how many went.
     async fn prune(&self, keep: Retention) -> Result<u64, Error>;
+}
+
+/// Subjects whose entries can be asked for: those that an index serves.
+#[derive(Clone, Copy, Debug)]
+pub enum Subjects<'a> {
+    /// What robots of these ids said, in their inbox.
+    Robots(&'a [Arc<str>]),
+    /// Changes of request ids.
+    RequestKeys(&'a [Arc<str>]),
+    /// Changes of attempts.
+    Attempts(&'a [Arc<str>]),
+}
+
+/// Entries of a feed that are wanted.
+pub(crate) struct Wanted {
+    pub(crate) logs: BTreeSet<Log>,
+    /// Ids of subjects, and the table whose changes are meant; no table: facts. None: all entries.
+    pub(crate) about: Option<(Option<Table>, BTreeSet<Arc<str>>)>,
+}
+
+impl Wanted {
+    pub(crate) fn from_logs(logs: &[Log]) -> Self {
+        Self { logs: logs.iter().copied().collect(), about: None }
+    }
+    pub(crate) fn from_subjects(subjects: Subjects<'_>) -> Result<Self, Error> {
+        let (log, table, ids) = match subjects {
+            Subjects::Robots(ids) => (Log::RobotInbox, None, ids),
+            Subjects::RequestKeys(ids) => (Log::Task, Some(Table::RequestKey), ids),
+            Subjects::Attempts(ids) => (Log::Fleet, Some(Table::Attempt), ids),
+        };
+        if ids.len() > GET_KEYS_MAX {
+            return Err(Error::TooManyKeys { asked: ids.len() });
+        }
+        Ok(Self { logs: BTreeSet::from([log]), about: Some((table, ids.iter().cloned().collect())) })
+    }
+    pub(crate) fn holds(&self, entry: &Entry) -> bool {
+        let is_about =
+            |(table, ids): &(Option<Table>, BTreeSet<_>)| entry.table == *table && ids.contains(&entry.subject);
+        self.logs.contains(&entry.log) && self.about.as_ref().is_none_or(is_about)
+    }
 }
 
 /// A page of at most `limit` entries; a short one means that there are no more up to `head`.

@@ -191,7 +191,7 @@ impl TaskService {
         let subject = [request_id.as_str().into()];
         let mut after = Seq(0);
         loop {
-            let page = match self.store().feed_of(Log::Task, &subject, after, ENTRIES).await {
+            let page = match self.store().feed_of(Subjects::RequestKeys(&subject), after, ENTRIES).await {
                 Err(Error::CursorExpired { asked, oldest }) if asked < oldest => {
                     after = oldest;
                     continue;
@@ -199,8 +199,7 @@ impl TaskService {
                 page => page?,
             };
             // The newest: an older use of the id, and that it was forgotten, may still be in the log.
-            let used = |e: &&Entry| e.table == Some(Table::RequestKey) && e.body.is_some();
-            if let Some(key) = page.entries.iter().rev().find(used) {
+            if let Some(key) = page.entries.iter().rev().find(|entry| entry.body.is_some()) {
                 return Ok(Seq(key.seq.0 + 1));
             }
             if page.next >= page.head {

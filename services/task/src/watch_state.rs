@@ -76,14 +76,14 @@ impl WatchState {
         let mut changed = BTreeSet::new();
         let mut after = Seq(0);
         loop {
-            let page = match store.feed_of(Log::Fleet, ids, after, FEED_PAGE_MAX).await {
+            let page = match store.feed_of(Subjects::Attempts(ids), after, FEED_PAGE_MAX).await {
                 Err(Error::CursorExpired { asked, oldest }) if asked < oldest => {
                     after = oldest;
                     continue;
                 }
                 page => page?,
             };
-            for entry in page.entries.iter().filter(|e| e.table == Some(Table::Attempt)) {
+            for entry in &page.entries {
                 changed.insert(entry.subject.clone());
                 if entry.seq <= place
                     && let Some(attempt) = read::<Attempt>(entry)?

@@ -158,7 +158,7 @@ impl TelemetryService {
         let page = if subjects.is_empty() {
             store.feed(after, &[Log::RobotInbox], size).await
         } else {
-            store.feed_of(Log::RobotInbox, &subjects, after, size).await
+            store.feed_of(Subjects::Robots(&subjects), after, size).await
         };
         let page = match page {
             Err(Error::CursorExpired { oldest, .. }) if r.cursor.is_empty() => {

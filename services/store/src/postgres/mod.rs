@@ -110,14 +110,8 @@ impl PostgresStore {
         })
     }
 
-    async fn page(
-        &self,
-        logs: &BTreeSet<Log>,
-        subjects: Option<&BTreeSet<Arc<str>>>,
-        after: Seq,
-        limit: usize,
-    ) -> Result<FeedPage, Error> {
-        patiently(read::feed(&self.readers, &self.site_id, logs, subjects, after, limit)).await
+    async fn page(&self, wanted: &Wanted, after: Seq, limit: usize) -> Result<FeedPage, Error> {
+        patiently(read::feed(&self.readers, &self.site_id, wanted, after, limit)).await
     }
 }
 
@@ -161,15 +155,11 @@ impl Store for PostgresStore {
     }
 
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {
-        self.page(&logs.iter().copied().collect(), None, after, limit).await
+        self.page(&Wanted::from_logs(logs), after, limit).await
     }
 
-    async fn feed_of(&self, log: Log, subjects: &[Arc<str>], after: Seq, limit: usize) -> Result<FeedPage, Error> {
-        if subjects.len() > GET_KEYS_MAX {
-            return Err(Error::TooManyKeys { asked: subjects.len() });
-        }
-        let subjects: BTreeSet<Arc<str>> = subjects.iter().cloned().collect();
-        self.page(&BTreeSet::from([log]), Some(&subjects), after, limit).await
+    async fn feed_of(&self, subjects: Subjects<'_>, after: Seq, limit: usize) -> Result<FeedPage, Error> {
+        self.page(&Wanted::from_subjects(subjects)?, after, limit).await
     }
 
     fn wake(&self) -> watch::Receiver<Seq> {

@@ -162,8 +162,7 @@ pub(super) async fn head<'c>(
 pub(super) async fn feed(
     readers: &PgPool,
     site_id: &SiteId,
-    logs: &BTreeSet<Log>,
-    subjects: Option<&BTreeSet<Arc<str>>>,
+    wanted: &Wanted,
     after: Seq,
     limit: usize,
 ) -> Result<FeedPage, Error> {
@@ -174,14 +173,15 @@ pub(super) async fn feed(
         // Nothing is after the head, whatever has been pruned before it.
         return Ok(page_of(Vec::new(), limit, head));
     }
-    let oldest = oldest_cursor(&mut transaction, site_id, logs).await.map_err(unavailable)?;
+    let oldest = oldest_cursor(&mut transaction, site_id, &wanted.logs).await.map_err(unavailable)?;
     if after < oldest || after > head {
         return Err(Error::CursorExpired { asked: after, oldest });
     }
-    let subjects: Option<Vec<&str>> = subjects.map(|of| of.iter().map(|s| &**s).filter(|s| is_text(s)).collect());
+    let texts = |ids: &BTreeSet<Arc<str>>| ids.iter().filter(|id| is_text(id)).cloned().collect();
+    let about = wanted.about.as_ref().map(|(table, ids)| (*table, texts(ids)));
     let mut entries = Vec::new();
-    for log in logs {
-        let page = log_page(&mut transaction, site_id, *log, subjects.as_deref(), after, limit).await;
+    for log in &wanted.logs {
+        let page = log_page(&mut transaction, site_id, *log, about.as_ref(), after, limit).await;
         entries.extend(page.map_err(unavailable)?);
     }
     entries.sort_unstable_by_key(|e: &Entry| e.seq);
@@ -207,17 +207,17 @@ async fn log_page(
     connection: &mut PgConnection,
     site_id: &SiteId,
     log: Log,
-    subjects: Option<&[&str]>,
+    about: Option<&(Option<Table>, Vec<Arc<str>>)>,
     after: Seq,
     limit: usize,
 ) -> Result<Vec<Entry>, sqlx::Error> {
-    let about = if subjects.is_some() { " AND subject = ANY($4)" } else { "" };
+    let asked = about.map_or_else(String::new, |(table, _)| format!(" AND subject = ANY($4){}", sql::of_table(*table)));
     let sql =
-        format!("SELECT {ENTRY_READ} FROM {} WHERE site_id = $1 AND seq > $2{about} ORDER BY seq LIMIT $3", log.name());
+        format!("SELECT {ENTRY_READ} FROM {} WHERE site_id = $1 AND seq > $2{asked} ORDER BY seq LIMIT $3", log.name());
     let mut select =
         sqlx::query(AssertSqlSafe(sql)).bind(site_id.as_str()).bind(after.0.cast_signed()).bind(limit as i64);
-    if let Some(subjects) = subjects {
-        select = select.bind(subjects);
+    if let Some((_, ids)) = about {
+        select = select.bind(ids);
     }
     let rows = select.fetch_all(connection).await?;
     rows.iter().map(|row| entry(log, row)).collect()

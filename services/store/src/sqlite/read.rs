@@ -155,25 +155,24 @@ fn rows_of(table: Table, rows: &[SqliteRow]) -> Result<Vec<Row>, sqlx::Error> {
 pub(super) async fn feed(
     readers: &SqlitePool,
     site_id: &SiteId,
-    logs: &BTreeSet<Log>,
-    subjects: Option<&BTreeSet<Arc<str>>>,
+    wanted: &Wanted,
     after: Seq,
     limit: usize,
 ) -> Result<FeedPage, Error> {
     let limit = limit.clamp(1, FEED_PAGE_MAX);
     let mut transaction = readers.begin().await.map_err(unavailable)?;
     let head = super::writer::head(&mut transaction, site_id).await.map_err(unavailable)?;
-    let oldest = oldest_cursor(&mut transaction, site_id, logs).await.map_err(unavailable)?;
+    let oldest = oldest_cursor(&mut transaction, site_id, &wanted.logs).await.map_err(unavailable)?;
     if after < oldest || after > head {
         return Err(Error::CursorExpired { asked: after, oldest });
     }
     let mut entries = Vec::new();
-    for log in logs {
-        let of_log = match subjects {
-            None => log_page(&mut transaction, site_id, *log, &[], after, limit).await,
-            Some(of) => {
+    for log in &wanted.logs {
+        let of_log = match &wanted.about {
+            None => log_page(&mut transaction, site_id, *log, None, &[], after, limit).await,
+            Some((table, of)) => {
                 let of: Vec<&Arc<str>> = of.iter().collect();
-                subject_pages(&mut transaction, site_id, *log, &of, after, limit).await
+                subject_pages(&mut transaction, site_id, *log, *table, &of, after, limit).await
             }
         };
         entries.extend(of_log.map_err(unavailable)?);
@@ -203,6 +202,7 @@ async fn subject_pages(
     connection: &mut SqliteConnection,
     site_id: &SiteId,
     log: Log,
+    table: Option<Table>,
     subjects: &[&Arc<str>],
     after: Seq,
     limit: usize,
@@ -210,7 +210,7 @@ async fn subject_pages(
     let mut entries = Vec::new();
     let per_statement = if subjects.len() <= SUBJECTS_SOUGHT { 1 } else { IDS_PER_STATEMENT };
     for slice in subjects.chunks(per_statement) {
-        entries.extend(log_page(connection, site_id, log, slice, after, limit).await?);
+        entries.extend(log_page(connection, site_id, log, table, slice, after, limit).await?);
     }
     Ok(entries)
 }
@@ -219,6 +219,7 @@ async fn log_page(
     connection: &mut SqliteConnection,
     site_id: &SiteId,
     log: Log,
+    table: Option<Table>,
     subjects: &[&Arc<str>],
     after: Seq,
     limit: usize,
@@ -226,7 +227,7 @@ async fn log_page(
     let about = if subjects.is_empty() {
         String::new()
     } else {
-        format!(" AND subject IN {}", placeholders(1, subjects.len()))
+        format!(" AND subject IN {}{}", placeholders(1, subjects.len()), sql::of_table(table))
     };
     let mut select = prepared(format!(
         "SELECT {ENTRY_READ} FROM {} WHERE site_id = ? AND seq > ?{about} ORDER BY seq LIMIT ?",

@@ -14,6 +14,17 @@ const GENERATION_KEYS: usize = 50_000;
 /// Revision and index columns of a row, or the knowledge that there is no such row.
 pub(super) type Standing = Option<(Revision, Index)>;
 
+/// Where a write moves a row in the indexes of its table.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
+pub(super) enum Moved {
+    /// It stands where it stood.
+    Nowhere,
+    /// In those that begin with its state.
+    ByState,
+    /// It is new, or nobody remembers where it stood.
+    Anywhere,
+}
+
 #[derive(Default)]
 pub(super) struct Revisions {
     young: HashMap<Key, Standing>,
@@ -31,10 +42,16 @@ impl Revisions {
         Some(revision)
     }
 
-    /// Whether the row is known to stand where it stands in the indexes of its table.
-    pub(super) fn has_index(&self, row: &Row) -> bool {
+    /// What becomes of a row in the indexes of its table.
+    pub(super) fn moved(&self, row: &Row) -> Moved {
         let standing = self.young.get(&row.key).or_else(|| self.old.get(&row.key));
-        standing.and_then(Option::as_ref).is_some_and(|(_, index)| *index == row.index)
+        match standing.and_then(Option::as_ref) {
+            Some((_, index)) if *index == row.index => Moved::Nowhere,
+            Some((_, Index { parent, order, .. })) if (parent, order) == (&row.index.parent, &row.index.order) => {
+                Moved::ByState
+            }
+            _ => Moved::Anywhere,
+        }
     }
 
     pub(super) fn note(&mut self, key: Key, standing: Standing) {
@@ -88,19 +105,20 @@ mod tests {
     }
 
     #[test]
-    fn a_row_moves_unless_it_is_known_to_stand_where_it_stands() {
+    fn a_row_moves_where_it_is_not_known_to_stand() {
         let mut revisions = Revisions::default();
-        let row = |state| Row {
+        let row = |state: i64, parent: Option<&str>| Row {
             key: key(0),
             revision: Revision(2),
-            index: Index { state: Some(state), ..Index::default() },
+            index: Index { state: Some(state), parent: parent.map(Into::into), order: None },
             body: "{}".into(),
         };
-        assert!(!revisions.has_index(&row(1)), "it is not known");
+        assert_eq!(revisions.moved(&row(1, None)), Moved::Anywhere, "it is not known");
         revisions.note(key(0), at(1, 1));
-        assert!(revisions.has_index(&row(1)));
-        assert!(!revisions.has_index(&row(2)), "it moved");
+        assert_eq!(revisions.moved(&row(1, None)), Moved::Nowhere);
+        assert_eq!(revisions.moved(&row(2, None)), Moved::ByState);
+        assert_eq!(revisions.moved(&row(1, Some("p"))), Moved::Anywhere);
         revisions.note(key(0), None);
-        assert!(!revisions.has_index(&row(1)), "it is new");
+        assert_eq!(revisions.moved(&row(1, None)), Moved::Anywhere, "it is new");
     }
 }

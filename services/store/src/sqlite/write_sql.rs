@@ -3,7 +3,7 @@
 //! Invariant: as [`super::batch`].
 
 use super::batch::{Batch, columns};
-use super::revisions::{Revisions, Standing};
+use super::revisions::{Moved, Revisions, Standing};
 use crate::audit::{self, Heads};
 use crate::group::{Group, sort_by_log, sort_by_table};
 use crate::sql::{self, ENTRY_COLUMNS, MOVE_AUDIT_HEAD, MOVED_AUDIT_HEAD, ROW_COLUMNS, ROW_CONFLICT, ord};
@@ -12,10 +12,17 @@ use midshift_core::rows::{Entry, Key, Log, Row, Seq, Table};
 use sqlx::{AssertSqlSafe, Error, Row as _, SqliteConnection};
 use std::collections::{BTreeMap, HashMap};
 
-/// What an upsert does with rows that are there and stay where they are in every index: SQLite writes an index anew if one of its columns is named,
-/// whether or not it changes.
-const BODY_CONFLICT: &str =
-    "ON CONFLICT (site_id, id) DO UPDATE SET revision = excluded.revision, body = excluded.body";
+/// What an upsert does with rows that are there. SQLite writes an index anew if one of its columns is named, whether or not it changes.
+const fn on_conflict(moved: Moved) -> &'static str {
+    match moved {
+        Moved::Nowhere => "ON CONFLICT (site_id, id) DO UPDATE SET revision = excluded.revision, body = excluded.body",
+        Moved::ByState => {
+            "ON CONFLICT (site_id, id) DO UPDATE \
+             SET revision = excluded.revision, state = excluded.state, body = excluded.body"
+        }
+        Moved::Anywhere => ROW_CONFLICT,
+    }
+}
 
 /// `rows` tuples of `columns` placeholders.
 pub(super) fn placeholders(rows: usize, columns: usize) -> String {
@@ -53,9 +60,13 @@ fn add_rows(
 ) -> Result<(), Error> {
     let (put, gone) = sort_by_table(rows);
     for (table, rows) in put {
-        let (stay, moved): (Vec<_>, Vec<_>) = rows.into_iter().partition(|row| before.has_index(row));
-        add_upsert(batch, site_id, table, stay, BODY_CONFLICT)?;
-        add_upsert(batch, site_id, table, moved, ROW_CONFLICT)?;
+        let mut by_move: BTreeMap<Moved, Vec<&Row>> = BTreeMap::new();
+        for row in rows {
+            by_move.entry(before.moved(row)).or_default().push(row);
+        }
+        for (moved, rows) in by_move {
+            add_upsert(batch, site_id, table, rows, on_conflict(moved))?;
+        }
     }
     for (table, ids) in gone {
         let delete =
@@ -66,9 +77,6 @@ fn add_rows(
 }
 
 fn add_upsert(batch: &mut Batch, site_id: &SiteId, table: Table, rows: Vec<&Row>, conflict: &str) -> Result<(), Error> {
-    if rows.is_empty() {
-        return Ok(());
-    }
     let values = |row: &Row| {
         let index = &row.index;
         let parent = index.parent.clone();

@@ -3,7 +3,7 @@
 use crate::support::{WALL, at, indexed, item, one, put};
 use midshift_core::item::{Expect, Fact, Item, RowChange, Write};
 use midshift_core::rows::{Index, Key, Log, Naming, Revision, Row, RowSelection, Seq, Table, Writer};
-use midshift_store::{CommitError, Cursor, Error, Query, Retention, Store};
+use midshift_store::{CommitError, Cursor, Error, Query, Retention, Store, Subjects};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
@@ -36,6 +36,7 @@ contract! {
     a_reading_holds_rows_by_key_and_what_belongs_to_each_that_it_holds
     a_prefix_lists_by_id_the_rows_that_begin_with_it
     a_submit_between_snapshot_and_commit_does_not_spoil_the_plan
+    a_mark_leaves_an_entry_where_nothing_else_does
     concurrent_writers_all_make_progress_and_numbers_have_no_holes
     a_row_reads_back_as_written_in_every_table
     entries_say_who_did_what_and_on_whose_request
@@ -141,12 +142,25 @@ async fn a_feed_of_subjects_holds_theirs_alone(store: Arc<dyn Store>) {
     let applied = store.commit(vec![inbox]).await.remove(0).unwrap();
     for after in [Seq(0), Seq(applied.seq.0 - 4)] {
         let of = [Arc::from("r1"), Arc::from("r3")];
-        let page = store.feed_of(Log::RobotInbox, &of, after, 2).await.unwrap();
+        let page = store.feed_of(Subjects::Robots(&of), after, 2).await.unwrap();
         let subjects: Vec<&str> = page.entries.iter().map(|e| &*e.subject).collect();
         assert_eq!(subjects, ["r1", "r3"]);
-        let rest = store.feed_of(Log::RobotInbox, &of, page.next, 2).await.unwrap();
+        let rest = store.feed_of(Subjects::Robots(&of), page.next, 2).await.unwrap();
         assert_eq!((rest.entries.len(), rest.next), (1, applied.seq));
-        assert!(store.feed_of(Log::RobotInbox, &[], after, 2).await.unwrap().entries.is_empty());
+        assert!(store.feed_of(Subjects::Robots(&[]), after, 2).await.unwrap().entries.is_empty());
+    }
+    let start = store.snapshot(&[]).await.unwrap().seq;
+    let of_fleet = [Table::Attempt, Table::Incident].map(|table| put(table, "x", Expect::Absent, "{}"));
+    one(&*store, Writer::Fleet, of_fleet.to_vec()).await.unwrap();
+    let of_task = [Table::RequestKey, Table::TaskIntake].map(|table| put(table, "x", Expect::Absent, "{}"));
+    one(&*store, Writer::Task, of_task.to_vec()).await.unwrap();
+    let of = [Arc::from("x")];
+    for (of, table) in [(Subjects::Attempts(&of), Table::Attempt), (Subjects::RequestKeys(&of), Table::RequestKey)] {
+        for after in [Seq(0), start] {
+            let page = store.feed_of(of, after, 9).await.unwrap();
+            let tables: Vec<_> = page.entries.iter().map(|entry| entry.table).collect();
+            assert_eq!(tables, [Some(table)], "others of the same id are not about it");
+        }
     }
 }
 
@@ -371,6 +385,22 @@ async fn a_submit_between_snapshot_and_commit_does_not_spoil_the_plan(store: Arc
     assert!(store.commit(vec![plan]).await[0].is_ok());
 }
 
+async fn a_mark_leaves_an_entry_where_nothing_else_does(store: Arc<dyn Store>) {
+    let start = store.snapshot(&[]).await.unwrap().seq;
+    let mark = |expect, body| put(Table::FleetMark, "fleet", expect, body);
+    let beside = vec![mark(Expect::Absent, "1"), put(Table::Attempt, "a", Expect::Absent, "{}")];
+    let first = one(&*store, Writer::Fleet, beside).await.unwrap();
+    assert_eq!(first.seq, Seq(start.0 + 1));
+    assert_eq!(first.revisions[0], (Key::new(Table::FleetMark, "fleet"), Revision(1)));
+    let second = one(&*store, Writer::Fleet, vec![mark(at(1), "2")]).await.unwrap();
+    assert_eq!(second.seq, Seq(start.0 + 2), "whoever waits for it is woken");
+    let page = store.feed(start, &[Log::Fleet], 10).await.unwrap();
+    let told: Vec<_> = page.entries.iter().map(|entry| entry.table).collect();
+    assert_eq!(told, [Some(Table::Attempt), Some(Table::FleetMark)]);
+    let marks = store.get(vec![Key::new(Table::FleetMark, "fleet")]).await.unwrap();
+    assert_eq!((&*marks[0].body, marks[0].revision), ("2", Revision(2)));
+}
+
 async fn concurrent_writers_all_make_progress_and_numbers_have_no_holes(store: Arc<dyn Store>) {
     const WRITERS: u64 = 16;
     const EACH: u64 = 8;
@@ -382,12 +412,13 @@ async fn concurrent_writers_all_make_progress_and_numbers_have_no_holes(store: A
             for n in 0..EACH {
                 // One row of its own and one that everybody fights over.
                 loop {
-                    let shared = store.get(vec![Key::new(Table::FleetMark, "shared")]).await.unwrap();
+                    let shared = store.get(vec![Key::new(Table::ServiceClock, "shared")]).await.unwrap();
                     let expect = shared.first().map_or(Expect::Absent, |row| Expect::At(row.revision));
                     let own = put(Table::Attempt, &format!("{writer}/{n}"), Expect::Absent, "{}");
-                    match one(&*store, Writer::Fleet, vec![own, put(Table::FleetMark, "shared", expect, "{}")]).await {
+                    match one(&*store, Writer::Fleet, vec![own, put(Table::ServiceClock, "shared", expect, "{}")]).await
+                    {
                         Ok(_) => break,
-                        Err(CommitError::Conflict { key, .. }) => assert_eq!(key.table, Table::FleetMark),
+                        Err(CommitError::Conflict { key, .. }) => assert_eq!(key.table, Table::ServiceClock),
                         Err(other) => panic!("{other}"),
                     }
                 }
@@ -395,7 +426,7 @@ async fn concurrent_writers_all_make_progress_and_numbers_have_no_holes(store: A
         });
     }
     tasks.join_all().await;
-    let shared = store.get(vec![Key::new(Table::FleetMark, "shared")]).await.unwrap();
+    let shared = store.get(vec![Key::new(Table::ServiceClock, "shared")]).await.unwrap();
     assert_eq!(shared[0].revision, Revision(WRITERS * EACH));
     let page = store.feed(start, &[Log::Fleet], 5_000).await.unwrap();
     let numbers: Vec<u64> = page.entries.iter().map(|e| e.seq.0).collect();
@@ -530,5 +561,5 @@ async fn a_text_that_an_engine_cannot_hold_is_refused_by_all(store: Arc<dyn Stor
     let nul = Key::new(Table::Attempt, "\0");
     assert!(store.get(vec![nul]).await.unwrap().is_empty(), "there is no such row, and to ask is no error");
     assert!(store.list(Query::all(Table::Attempt).of_parent("\0")).await.unwrap().is_empty());
-    assert!(store.feed_of(Log::Fleet, &[Arc::from("\0")], Seq(0), 9).await.unwrap().entries.is_empty());
+    assert!(store.feed_of(Subjects::Attempts(&[Arc::from("\0")]), Seq(0), 9).await.unwrap().entries.is_empty());
 }

@@ -40,12 +40,13 @@ async fn race(config: &PostgresConfig) {
         tasks.spawn(async move {
             for n in 0..EACH {
                 loop {
-                    let shared = store.get(vec![Key::new(Table::FleetMark, "shared")]).await.unwrap();
+                    let shared = store.get(vec![Key::new(Table::ServiceClock, "shared")]).await.unwrap();
                     let expect = shared.first().map_or(Expect::Absent, |row| Expect::At(row.revision));
                     let own = put(Table::Attempt, &format!("{process}/{n}"), Expect::Absent, "{}");
-                    match one(&*store, Writer::Fleet, vec![own, put(Table::FleetMark, "shared", expect, "{}")]).await {
+                    match one(&*store, Writer::Fleet, vec![own, put(Table::ServiceClock, "shared", expect, "{}")]).await
+                    {
                         Ok(_) => break,
-                        Err(CommitError::Conflict { key, .. }) => assert_eq!(key.table, Table::FleetMark),
+                        Err(CommitError::Conflict { key, .. }) => assert_eq!(key.table, Table::ServiceClock),
                         Err(other) => panic!("{other}: {other:?}"),
                     }
                 }
@@ -53,12 +54,12 @@ async fn race(config: &PostgresConfig) {
         });
     }
     tasks.join_all().await;
-    let shared = stores[1].get(vec![Key::new(Table::FleetMark, "shared")]).await.unwrap();
+    let shared = stores[1].get(vec![Key::new(Table::ServiceClock, "shared")]).await.unwrap();
     assert_eq!(shared[0].revision, Revision(2 * EACH), "each item was applied once");
     let page = stores[1].feed(start, &[Log::Fleet], 5_000).await.unwrap();
     let numbers: Vec<u64> = page.entries.iter().map(|e| e.seq.0).collect();
     assert_eq!(numbers, (start.0 + 1..=start.0 + 4 * EACH).collect::<Vec<_>>());
-    let revisions = page.entries.iter().filter(|e| e.table == Some(Table::FleetMark)).map(|e| e.revision.0);
+    let revisions = page.entries.iter().filter(|e| e.table == Some(Table::ServiceClock)).map(|e| e.revision.0);
     assert!(revisions.eq(1..=2 * EACH), "in the order in which they were applied");
 }
 

@@ -250,8 +250,8 @@ impl Store for Shaky {
         self.count(page.entries.len());
         Ok(page)
     }
-    async fn feed_of(&self, log: Log, subjects: &[Arc<str>], after: Seq, limit: usize) -> Result<FeedPage, Error> {
-        self.inner.feed_of(log, subjects, after, limit).await
+    async fn feed_of(&self, subjects: Subjects<'_>, after: Seq, limit: usize) -> Result<FeedPage, Error> {
+        self.inner.feed_of(subjects, after, limit).await
     }
     fn wake(&self) -> watch::Receiver<Seq> {
         self.inner.wake()

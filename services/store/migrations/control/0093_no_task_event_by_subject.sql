@@ -1,0 +1,1 @@
+DROP INDEX task_event_by_subject

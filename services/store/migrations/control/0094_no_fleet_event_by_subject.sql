@@ -1,0 +1,1 @@
+DROP INDEX fleet_event_by_subject

@@ -1,0 +1,1 @@
+DROP INDEX telemetry_event_by_subject

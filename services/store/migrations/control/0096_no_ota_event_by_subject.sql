@@ -1,0 +1,1 @@
+DROP INDEX ota_event_by_subject

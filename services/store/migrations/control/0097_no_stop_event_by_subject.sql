@@ -1,0 +1,1 @@
+DROP INDEX stop_event_by_subject

@@ -1,0 +1,1 @@
+DROP INDEX identity_event_by_subject
