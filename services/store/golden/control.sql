@@ -704,19 +704,15 @@ CREATE INDEX bundle_by_ord ON bundle (site_id, ord, id);
 
 CREATE INDEX fleet_audit_by_ord ON fleet_audit (site_id, ord, id);
 
-CREATE INDEX fleet_event_by_subject ON fleet_event (site_id, subject, seq);
+CREATE INDEX fleet_event_by_attempt ON fleet_event (site_id, subject, seq) WHERE tbl = 'attempt';
 
 CREATE INDEX identity_audit_by_ord ON identity_audit (site_id, ord, id);
-
-CREATE INDEX identity_event_by_subject ON identity_event (site_id, subject, seq);
 
 CREATE INDEX incident_by_ord ON incident (site_id, ord, id);
 
 CREATE INDEX incident_by_state ON incident (site_id, state, ord, id);
 
 CREATE INDEX ota_audit_by_ord ON ota_audit (site_id, ord, id);
-
-CREATE INDEX ota_event_by_subject ON ota_event (site_id, subject, seq);
 
 CREATE INDEX request_key_by_ord ON request_key (site_id, ord, id);
 
@@ -734,11 +730,9 @@ CREATE INDEX rollout_robot_by_state ON rollout_robot (site_id, state, ord, id);
 
 CREATE INDEX stop_audit_by_ord ON stop_audit (site_id, ord, id);
 
-CREATE INDEX stop_event_by_subject ON stop_event (site_id, subject, seq);
-
 CREATE INDEX task_audit_by_ord ON task_audit (site_id, ord, id);
 
-CREATE INDEX task_event_by_subject ON task_event (site_id, subject, seq);
+CREATE INDEX task_event_by_request_key ON task_event (site_id, subject, seq) WHERE tbl = 'request_key';
 
 CREATE INDEX task_intake_by_ord ON task_intake (site_id, ord, id);
 
@@ -751,8 +745,6 @@ CREATE INDEX task_state_by_ord ON task_state (site_id, ord, id);
 CREATE INDEX task_state_by_parent ON task_state (site_id, parent, ord, id);
 
 CREATE INDEX task_state_by_state ON task_state (site_id, state, ord, id);
-
-CREATE INDEX telemetry_event_by_subject ON telemetry_event (site_id, subject, seq);
 
 CREATE INDEX timer_by_ord ON timer (site_id, ord, id);
 

@@ -8,9 +8,10 @@ use crate::audit::{AuditDrafts, Heads};
 use crate::check::{After, decide, log_index};
 use crate::gather::Gathered;
 use crate::model_table::Rows;
+use crate::store::Wanted;
 use crate::{
     Applied, CommitError, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Retention, SEQ_PLAUSIBLE_MAX, Snapshot,
-    Store, StoreId,
+    Store, StoreId, Subjects,
 };
 use async_trait::async_trait;
 use midshift_core::audit::Head;

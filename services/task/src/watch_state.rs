@@ -3,9 +3,9 @@
 //! Invariant: an attempt here is as it was right after the last entry taken, however far the rows have gone on since.
 
 use midshift_core::ids::{AttemptId, TaskId};
-use midshift_core::rows::{BadRow, Entry, Key, Log, Record, Row, Seq, Table};
+use midshift_core::rows::{BadRow, Entry, Key, Record, Row, Seq, Table};
 use midshift_core::task::{Attempt, TaskIntake, TaskState};
-use midshift_store::{Error, FEED_PAGE_MAX, Store};
+use midshift_store::{Error, FEED_PAGE_MAX, Store, Subjects};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 

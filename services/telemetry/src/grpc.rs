@@ -19,7 +19,7 @@ use midshift_proto::convert::telemetry::{RobotView, encode_event, encode_robot, 
 use midshift_proto::pages;
 use midshift_proto::telemetry::v1::{self, telemetry_service_server::TelemetryService as Face};
 use midshift_proto::watches::{self, Gone, Reader, Teller};
-use midshift_store::{Dirty, Error};
+use midshift_store::{Dirty, Error, Subjects};
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Bound;
 use std::sync::Arc;

@@ -24,8 +24,10 @@ pub use heartbeats::PostgresHeartbeats;
 
 use crate::migrations::{CONTROL, Migrated, TELEMETRY};
 use crate::queue::{PRUNE_SLICE, Queue, going, run, unavailable};
+use crate::store::Wanted;
 use crate::{
     Applied, CommitError, Error, FeedPage, GET_KEYS_MAX, OpenError, Query, Retention, Snapshot, Store, StoreId,
+    Subjects,
 };
 use async_trait::async_trait;
 use connect::{CONTROL_SCHEMA, Database, TELEMETRY_SCHEMA, patiently};
@@ -36,7 +38,7 @@ use midshift_core::item::Item;
 use midshift_core::rows::{Key, Log, Naming, Row, RowSelection, Seq, Writer as Author};
 use midshift_core::time::Clock;
 use sqlx::PgPool;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;

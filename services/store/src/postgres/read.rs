@@ -8,14 +8,13 @@ use crate::audit::{self, Heads};
 use crate::gather::Gathered;
 use crate::queue::unavailable;
 use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
-use crate::store::page_of;
+use crate::store::{Wanted, page_of};
 use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Snapshot};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Naming, Row, RowSelection, Seq, Table};
 use sqlx::postgres::PgRow;
 use sqlx::{AssertSqlSafe, PgConnection, PgPool, Postgres, Row as _, Transaction};
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
 
 /// One snapshot for all statements, whatever the database's own default is.
 pub(super) const BEGIN: &str = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY";
@@ -177,8 +176,10 @@ pub(super) async fn feed(
     if after < oldest || after > head {
         return Err(Error::CursorExpired { asked: after, oldest });
     }
-    let texts = |ids: &BTreeSet<Arc<str>>| ids.iter().filter(|id| is_text(id)).cloned().collect();
-    let about = wanted.about.as_ref().map(|(table, ids)| (*table, texts(ids)));
+    let about = wanted.about.as_ref().map(|(table, ids)| {
+        let ids: Vec<&str> = ids.iter().map(|id| &**id).filter(|id| is_text(id)).collect();
+        (*table, ids)
+    });
     let mut entries = Vec::new();
     for log in &wanted.logs {
         let page = log_page(&mut transaction, site_id, *log, about.as_ref(), after, limit).await;
@@ -207,7 +208,7 @@ async fn log_page(
     connection: &mut PgConnection,
     site_id: &SiteId,
     log: Log,
-    about: Option<&(Option<Table>, Vec<Arc<str>>)>,
+    about: Option<&(Option<Table>, Vec<&str>)>,
     after: Seq,
     limit: usize,
 ) -> Result<Vec<Entry>, sqlx::Error> {

@@ -21,8 +21,10 @@ pub use frames::SqliteFrames;
 
 use crate::migrations::{CONTROL, Migrated, TELEMETRY};
 use crate::queue::{PRUNE_SLICE, Queue, going, run, unavailable};
+use crate::store::Wanted;
 use crate::{
     Applied, CommitError, Error, FeedPage, GET_KEYS_MAX, OpenError, Query, Retention, Snapshot, Store, StoreId,
+    Subjects,
 };
 use async_trait::async_trait;
 use file::{CONTROL_DB, DataFile, TELEMETRY_DB};
@@ -30,10 +32,10 @@ use midshift_core::Boxed;
 use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
 use midshift_core::item::Item;
-use midshift_core::rows::{Entry, Key, Log, Naming, Row, RowSelection, Seq, Writer as Author};
+use midshift_core::rows::{Key, Log, Naming, Row, RowSelection, Seq, Writer as Author};
 use midshift_core::time::Clock;
 use sqlx::SqlitePool;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use tail::Tail;

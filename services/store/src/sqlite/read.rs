@@ -8,7 +8,7 @@ use crate::audit::{self, Heads};
 use crate::gather::Gathered;
 use crate::queue::unavailable;
 use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
-use crate::store::page_of;
+use crate::store::{Wanted, page_of};
 use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Naming, Row, RowSelection, Seq, Table};

@@ -133,7 +133,7 @@ async fn a_copy_is_one_moment_of_both_schemas_while_servers_write() {
     let writing = tokio::spawn(async move {
         for n in 0.. {
             let expect = if n == 0 { Expect::Absent } else { at(n) };
-            let pair = [Table::Attempt, Table::FleetMark].map(|table| put(table, "pair", expect, &n.to_string()));
+            let pair = [Table::Attempt, Table::ServiceClock].map(|table| put(table, "pair", expect, &n.to_string()));
             one(&*writer, Writer::Fleet, pair.to_vec()).await.unwrap();
             counter.store(n + 1, Ordering::SeqCst);
         }
@@ -159,7 +159,7 @@ async fn a_copy_is_one_moment_of_both_schemas_while_servers_write() {
     let to = fresh();
     restored(&to, dir.path(), &copy).await.unwrap();
     let restored = postgres_at(&to).await;
-    let rows = restored.snapshot(&[Table::Attempt, Table::FleetMark]).await.unwrap();
+    let rows = restored.snapshot(&[Table::Attempt, Table::ServiceClock]).await.unwrap();
     assert_eq!((rows.rows.len(), rows.seq), (2, copy.head));
     assert_eq!((&rows.rows[0].body, rows.rows[0].revision), (&rows.rows[1].body, rows.rows[1].revision));
     let times = rows.rows[0].revision.0;

@@ -6,7 +6,7 @@ use midshift_core::audit::Head;
 use midshift_core::ids::SiteId;
 use midshift_core::item::{Expect, Item};
 use midshift_core::rows::{Key, Log, Naming, Row, RowSelection, Seq, Table, Writer};
-use midshift_store::{Applied, CommitError, Error, FeedPage, Query, Retention, Snapshot, Store, StoreId};
+use midshift_store::{Applied, CommitError, Error, FeedPage, Query, Retention, Snapshot, Store, StoreId, Subjects};
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
