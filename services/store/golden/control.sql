@@ -738,15 +738,11 @@ CREATE INDEX task_intake_by_ord ON task_intake (site_id, ord, id);
 
 CREATE INDEX task_request_by_ord ON task_request (site_id, ord, id);
 
-CREATE INDEX task_request_by_parent ON task_request (site_id, parent, ord, id);
-
 CREATE INDEX task_state_by_ord ON task_state (site_id, ord, id);
 
 CREATE INDEX task_state_by_parent ON task_state (site_id, parent, ord, id);
 
 CREATE INDEX task_state_by_state ON task_state (site_id, state, ord, id);
-
-CREATE INDEX timer_by_ord ON timer (site_id, ord, id);
 
 CREATE INDEX token_by_ord ON token (site_id, ord, id);
 

@@ -120,6 +120,8 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0098_no_identity_event_by_subject",
     "0099_task_event_by_request_key",
     "0100_fleet_event_by_attempt",
+    "0101_no_timer_by_ord",
+    "0102_no_task_request_by_parent",
 ];
 
 /// Of `telemetry.db`.

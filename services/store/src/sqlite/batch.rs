@@ -16,6 +16,9 @@ use tokio_stream::{Stream, StreamExt};
 /// When a transaction is looked at of which no word has come that its COMMIT began.
 const LOOK_AFTER: Duration = Duration::from_millis(10);
 
+/// The rows of one value. `json_each` would write each of them as text, which every column reads again.
+pub(super) const EACH_ROW: &str = "jsonb_each(?)";
+
 /// Statements with their values, in order.
 #[derive(Default)]
 pub(super) struct Batch {
@@ -57,7 +60,7 @@ impl Batch {
         Ok(self)
     }
 
-    /// The next value: what `json_each` makes rows of.
+    /// The next value: what [`EACH_ROW`] makes rows of, or `json_each` of plain values.
     pub(super) fn bind_rows(&mut self, rows: impl IntoIterator<Item: Serialize>) -> Result<&mut Self, Error> {
         let rows: Vec<_> = rows.into_iter().collect();
         self.bind(&serde_json::to_string(&rows).map_err(|error| Error::Encode(error.into()))?)
@@ -117,7 +120,7 @@ pub(super) async fn tell_commits(connection: &mut SqliteConnection) -> Result<Ar
     Ok(told)
 }
 
-/// The first columns of a row of `json_each`.
+/// The first columns of [`EACH_ROW`].
 pub(super) fn columns(count: usize) -> String {
     (0..count).map(|column| format!("value->>{column}")).collect::<Vec<_>>().join(", ")
 }

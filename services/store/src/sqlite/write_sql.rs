@@ -2,7 +2,7 @@
 //!
 //! Invariant: as [`super::batch`].
 
-use super::batch::{Batch, columns};
+use super::batch::{Batch, EACH_ROW, columns};
 use super::revisions::{Moved, Revisions, Standing};
 use crate::audit::{self, Heads};
 use crate::group::{Group, sort_by_log, sort_by_table};
@@ -84,7 +84,7 @@ fn add_upsert(batch: &mut Batch, site_id: &SiteId, table: Table, rows: Vec<&Row>
     };
     // SQLite cannot tell ON CONFLICT from a join without a WHERE before it.
     let upsert = format!(
-        "INSERT INTO {} ({ROW_COLUMNS}) SELECT ?, {} FROM json_each(?) WHERE true {conflict}",
+        "INSERT INTO {} ({ROW_COLUMNS}) SELECT ?, {} FROM {EACH_ROW} WHERE true {conflict}",
         table.name(),
         columns(6),
     );
@@ -110,8 +110,7 @@ fn add_entries(batch: &mut Batch, site_id: &SiteId, entries: &[Entry]) -> Result
                 entry.at_unix_ms,
             )
         };
-        let append =
-            format!("INSERT INTO {} ({ENTRY_COLUMNS}) SELECT ?, {} FROM json_each(?)", log.name(), columns(12),);
+        let append = format!("INSERT INTO {} ({ENTRY_COLUMNS}) SELECT ?, {} FROM {EACH_ROW}", log.name(), columns(12),);
         batch.push(&append).bind(site_id.as_str())?.bind_rows(entries.into_iter().map(values))?;
     }
     Ok(())

@@ -1,0 +1,1 @@
+DROP INDEX task_request_by_parent
