@@ -31,6 +31,9 @@ const READERS: u32 = 4;
 const CHECKPOINT_PAUSE: Duration = Duration::from_secs(1);
 /// A checkpoint that empties the log holds the writer up while it waits for a slow reader: at most so long, then it tries later.
 const CHECKPOINT_BUSY: &str = "PRAGMA busy_timeout = 200";
+/// A write-ahead log of so many pages begins anew in the same file, with the writer waiting for the last of them: where there are blocks already, a
+/// sync writes nothing but them.
+const WAL_PAGES_MAX: i64 = 4 * 1024;
 /// A write-ahead log above this is emptied with the writer waiting, which bounds the disk and the next start.
 const WAL_BYTES_MAX: u64 = 64 * 1024 * 1024;
 
@@ -74,7 +77,9 @@ impl DataFile {
             .create_if_missing(true)
             .journal_mode(SqliteJournalMode::Wal)
             .synchronous(SqliteSynchronous::Full)
-            .pragma("wal_autocheckpoint", "0");
+            .pragma("wal_autocheckpoint", "0")
+            // What takes a statement back would come into a temporary file, of which a container may have none.
+            .pragma("temp_store", "MEMORY");
         let mut connection =
             options.connect().await.map_err(|source| OpenError::Sql { doing: "opening for writing", source })?;
         assert_pragma(&mut connection, "journal_mode", "wal").await?;
@@ -123,12 +128,14 @@ impl DataFile {
             Some(connection) => connection,
             None => connection.insert(self.checkpointer().await?),
         };
-        let sql =
-            if bytes > WAL_BYTES_MAX { "PRAGMA wal_checkpoint(TRUNCATE)" } else { "PRAGMA wal_checkpoint(PASSIVE)" };
-        sqlx::query(sql)
-            .execute(connection)
-            .await
-            .map_err(|source| OpenError::Sql { doing: "checkpointing", source })?;
+        let failed = |source| OpenError::Sql { doing: "checkpointing", source };
+        let done = sqlx::query("PRAGMA wal_checkpoint(PASSIVE)").fetch_one(&mut *connection).await.map_err(failed)?;
+        let pages: i64 = done.try_get(1).map_err(failed)?;
+        if bytes > WAL_BYTES_MAX {
+            sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)").execute(connection).await.map_err(failed)?;
+        } else if pages > WAL_PAGES_MAX {
+            sqlx::query("PRAGMA wal_checkpoint(RESTART)").execute(connection).await.map_err(failed)?;
+        }
         metrics::gauge!("midshift_store_wal_bytes", "file" => self.name).set(bytes as f64);
         Ok(())
     }
