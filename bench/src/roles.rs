@@ -114,9 +114,9 @@ pub fn play(args: ChildArgs) -> anyhow::Result<()> {
     raise_files_max()?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     let stop = CancellationToken::new();
-    let ended = runtime.block_on(role(args.role, stop));
+    let ended = runtime.block_on(runtime.spawn(role(args.role, stop)));
     runtime.shutdown_background();
-    ended
+    ended?
 }
 
 async fn role(role: Role, stop: CancellationToken) -> anyhow::Result<()> {

@@ -134,32 +134,33 @@ pub fn main() -> ExitCode {
     }
     let serves = matches!(&args.command, Command::Serve(_) | Command::Agent(_) | Command::Sim(sim::Verb::Run { .. }));
     logs::start(args.log, if serves { "info" } else { "warn" });
-    let out = Out::for_output(args.output);
+    // For as long as the program runs.
+    let out: &'static Out = Box::leak(Box::new(Out::for_output(args.output)));
     let makes_page = matches!(&args.command, Command::Client(command) if command.makes_page());
     if out.is_page() && !makes_page {
-        return Exit::usage("only `midshift rollout report` makes a page\n  try: -o json").report(&out);
+        return Exit::usage("only `midshift rollout report` makes a page\n  try: -o json").report(out);
     }
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,
-        Err(error) => return Exit::from(anyhow::anyhow!("starting the runtime: {error}")).report(&out),
+        Err(error) => return Exit::from(anyhow::anyhow!("starting the runtime: {error}")).report(out),
     };
     let result = runtime.block_on(async {
         tokio::select! {
-            result = run(args.command, &out) => result,
+            result = run(args.command, out) => result,
             () = logs::count_floods(), if serves => unreachable!("it counts for as long as it is let"),
         }
     });
     runtime.shutdown_timeout(Duration::from_secs(2));
     match result {
         Ok(()) => ExitCode::SUCCESS,
-        Err(exit) => exit.report(&out),
+        Err(exit) => exit.report(out),
     }
 }
 
-async fn run(command: Command, out: &Out) -> Result<(), Exit> {
+async fn run(command: Command, out: &'static Out) -> Result<(), Exit> {
     match command {
         Command::Dev(args) => develop(*args, out).await,
-        Command::Serve(args) => Ok(serve::run(args, interrupts(), &|text| out.line(text)).await?),
+        Command::Serve(args) => serve_on_workers(args, out).await,
         Command::Migrate { data, database } => migrate(&data.unwrap_or_default(), &database, out).await,
         Command::Backup(args) => backup::back_up(&args, out).await,
         Command::Restore(args) => backup::restore(&args, out).await,
@@ -174,6 +175,15 @@ async fn run(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Client(command) => midshift_cli::run(command, out).await,
         Command::Stop(stop) => stop::run(*stop, out).await,
         Command::Certificate(verb) => certificate::run(*verb, interrupts(), out).await,
+    }
+}
+
+/// On the runtime's own threads: the one that waits for this would be one more to wake for each commit.
+async fn serve_on_workers(args: serve::Serve, out: &'static Out) -> Result<(), Exit> {
+    let served = tokio::spawn(async move { serve::run(args, interrupts(), &|text| out.line(text)).await });
+    match served.await {
+        Ok(ended) => Ok(ended?),
+        Err(error) => std::panic::resume_unwind(error.into_panic()),
     }
 }
 
