@@ -12,7 +12,7 @@ use midshift_core::item::Item;
 use midshift_core::rows::{Key, Log, Naming, Row, RowSelection, Seq, Writer};
 use midshift_store::{
     Applied, Cause, Coarsen, CommitError, Error, FeedPage, Frame, FrameLog, FrameMark, FramesOldest, Gap, MemoryFrames,
-    MemoryStore, Query, Retention, Snapshot, Store, StoreId, StoredFrame,
+    MemoryStore, Query, Retention, Snapshot, Store, StoreId, StoredFrame, Subjects,
 };
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
@@ -150,9 +150,9 @@ impl Store for ServerDisk {
         self.readable()?;
         self.inner.feed(after, logs, limit).await
     }
-    async fn feed_of(&self, log: Log, subjects: &[Arc<str>], after: Seq, limit: usize) -> Result<FeedPage, Error> {
+    async fn feed_of(&self, subjects: Subjects<'_>, after: Seq, limit: usize) -> Result<FeedPage, Error> {
         self.readable()?;
-        self.inner.feed_of(log, subjects, after, limit).await
+        self.inner.feed_of(subjects, after, limit).await
     }
     fn wake(&self) -> watch::Receiver<Seq> {
         self.inner.wake()
