@@ -32,6 +32,10 @@ use std::path::{Path, PathBuf};
 
 /// Tasks are spawned in a crate's `lib.rs`. Elsewhere only here, each for a reason.
 const SPAWNS: &[(&str, &str)] = &[
+    (
+        "services/midshift/src/commands/mod.rs",
+        "a server runs on the runtime's own threads, not on the one that waits for them",
+    ),
     ("services/telemetry/src/link.rs", "one task a session: it must outlive the handler that opened it"),
     ("services/telemetry/src/facts.rs", "one fact: the robot's stream may be gone before it is written"),
     ("services/telemetry/src/grpc.rs", "one task a watching stream, ended by its reader or by shutdown"),
