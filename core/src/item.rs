@@ -46,6 +46,13 @@ pub struct RowChange {
     pub kind: &'static str,
 }
 
+impl RowChange {
+    /// Whether it leaves an entry in the log of its writer, in an item whose marks do ([`Item::tells_marks`]) or do not.
+    pub fn is_told(&self, tells_marks: bool) -> bool {
+        !matches!(self.write, Write::Keep) && (tells_marks || !self.key.table.is_mark())
+    }
+}
+
 /// A fact that is not a row change: a robot's event in its inbox.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Fact {
@@ -168,8 +175,7 @@ impl Item {
     /// Whether its marks leave entries. How far a service has read concerns nobody else, and the service reads it from the row: a mark leaves an entry
     /// where nothing else of the item does, so that whoever waits for it is woken.
     pub fn tells_marks(&self) -> bool {
-        let is_told = |row: &RowChange| !matches!(row.write, Write::Keep) && !row.key.table.is_mark();
-        self.facts.is_empty() && !self.rows.iter().any(is_told)
+        self.facts.is_empty() && !self.rows.iter().any(|row| row.is_told(false))
     }
     /// Whether it would change anything.
     pub fn is_empty(&self) -> bool {

@@ -81,8 +81,8 @@ pub fn touched(items: &[Item]) -> Vec<Key> {
 /// Entries that an item leaves in the log of its writer and the inbox once it is applied.
 pub fn entries_of(item: &Item) -> u64 {
     let tells_marks = item.tells_marks();
-    let is_told = |row: &&RowChange| !matches!(row.write, Write::Keep) && (tells_marks || !row.key.table.is_mark());
-    (item.rows.iter().filter(is_told).count() + item.facts.len()) as u64
+    let rows = item.rows.iter().filter(|row| row.is_told(tells_marks)).count();
+    (rows + item.facts.len()) as u64
 }
 
 /// The one row of a table that an item puts; none if it puts none.

@@ -126,7 +126,9 @@ pub(crate) fn decide(
         }
     };
     let seq = &mut decided.applied.seq;
-    for RowChange { key, expect, write, kind } in rows {
+    for change in rows {
+        let is_told = change.is_told(tells_marks);
+        let RowChange { key, expect, write, kind } = change;
         let revision = match expect {
             Expect::Absent => Revision(1),
             Expect::At(revision) => revision.next(),
@@ -136,7 +138,7 @@ pub(crate) fn decide(
             Write::Put { index, body } => (index, Some(body)),
             Write::Delete => (Index::default(), None),
         };
-        if tells_marks || !key.table.is_mark() {
+        if is_told {
             let entry = entry(seq, Log::of_writer(writer), key.id.clone(), kind, body.clone());
             decided.entries.push(Entry { table: Some(key.table), revision, index: index.clone(), ..entry });
         }

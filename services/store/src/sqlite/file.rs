@@ -25,6 +25,8 @@ const LOCK_PAUSE: Duration = Duration::from_millis(20);
 const BUSY_TIMEOUT: Duration = Duration::from_secs(30);
 /// Texts of groups: a text for each set of tables and logs that one group writes.
 const STATEMENTS_CACHED: usize = 128;
+/// Results that wait to be looked at: of each statement of the longest text, so that it never waits for whoever asked.
+const RESULTS_WAITING: usize = 256;
 /// Read connections: a list, a snapshot and two feeds at once; more only share the disk.
 const READERS: u32 = 4;
 /// Pause between checkpoints.
@@ -75,6 +77,7 @@ impl DataFile {
         let options = self
             .options()
             .create_if_missing(true)
+            .row_buffer_size(RESULTS_WAITING)
             .journal_mode(SqliteJournalMode::Wal)
             .synchronous(SqliteSynchronous::Full)
             .pragma("wal_autocheckpoint", "0")
