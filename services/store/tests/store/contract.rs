@@ -32,6 +32,7 @@ contract! {
     an_item_over_its_limit_or_with_a_row_twice_is_refused
     a_list_pages_through_every_row_once_in_both_directions
     a_list_filters_by_state_and_parent_as_they_are_now
+    a_row_that_moves_in_one_index_alone_is_found_where_it_is
     a_reading_holds_its_parts_and_what_they_name_and_nothing_else
     a_reading_holds_rows_by_key_and_what_belongs_to_each_that_it_holds
     a_prefix_lists_by_id_the_rows_that_begin_with_it
@@ -271,6 +272,31 @@ async fn a_list_filters_by_state_and_parent_as_they_are_now(store: Arc<dyn Store
     assert_eq!(ids(all().of_parent("t1")).await, ["b", "a"]);
     assert_eq!(ids(all().of_parent("t1").in_states([3])).await, ["a"]);
     assert_eq!(ids(Query { limit: 1, newest_first: true, ..all().in_states([2, 3]) }).await, ["c"]);
+}
+
+async fn a_row_that_moves_in_one_index_alone_is_found_where_it_is(store: Arc<dyn Store>) {
+    let all = || Query::all(Table::Attempt);
+    let mut expect = Expect::Absent;
+    for (n, (state, parent, order)) in
+        [(1, "p", 1), (2, "p", 1), (2, "q", 1), (2, "q", 9), (2, "q", 9), (1, "p", 1)].into_iter().enumerate()
+    {
+        let index = Index { state: Some(state), parent: Some(Arc::from(parent)), order: Some(order) };
+        let body = n.to_string();
+        one(&*store, Writer::Fleet, vec![indexed(Table::Attempt, "a", expect, &body, index.clone())]).await.unwrap();
+        let row = Row {
+            key: Key::new(Table::Attempt, "a"),
+            revision: Revision(n as u64 + 1),
+            index,
+            body: body.as_str().into(),
+        };
+        expect = Expect::At(row.revision);
+        let after = Cursor { order: order - 1, id: Arc::from("a") };
+        for query in [all().in_states([state]), all().of_parent(parent), Query { after: Some(after), ..all() }] {
+            assert_eq!(store.list(query.clone()).await.unwrap(), [row.clone()], "{query:?}");
+        }
+        assert_eq!(store.list(all().in_states([3 - state])).await.unwrap(), []);
+        assert_eq!(store.list(all().of_parent(if parent == "p" { "q" } else { "p" })).await.unwrap(), []);
+    }
 }
 
 async fn a_reading_holds_its_parts_and_what_they_name_and_nothing_else(store: Arc<dyn Store>) {
