@@ -88,8 +88,9 @@ fn encode(inner: &Inner, robot_id: &RobotId, live: Option<&NewestHeartbeat>) -> 
             durable.insert(Lane::Critical, mark.critical);
             durable.insert(Lane::Event, mark.event);
         }
-        if let Some(seq) = rows.status.get(&(robot_id.clone(), Arc::from(session.ring.as_str()))) {
-            durable.insert(Lane::Status, *seq);
+        let status = rows.durable_status(robot_id, &Arc::from(session.ring.as_str()));
+        if status > 0 {
+            durable.insert(Lane::Status, status);
         }
     }
     let presence = rows.presence.get(robot_id);

@@ -7,6 +7,7 @@ use crate::misreads::Misreads;
 use crate::projection::LinkProjection;
 use crate::registry::Registry;
 use crate::shared_heartbeats::Shared;
+use crate::status_writer::StatusWriter;
 use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::time::Clock;
 use midshift_store::{FrameLog, HeartbeatLog, LiveBoard, Store};
@@ -40,6 +41,7 @@ pub(crate) struct Inner {
     pub misreads: Misreads,
     pub beacons: BeaconListener,
     pub shared: Option<Shared>,
+    pub status_writer: StatusWriter,
     /// Room for robots that say hello.
     pub hellos: Arc<Semaphore>,
     /// Robots are asked to go to another gateway, and no new one is taken.

@@ -25,6 +25,7 @@ mod retention;
 mod session;
 mod shared_heartbeats;
 mod status;
+mod status_writer;
 mod stops;
 mod waits;
 mod welcome;
@@ -43,6 +44,7 @@ use midshift_proto::telemetry::v1::telemetry_service_server::TelemetryServiceSer
 use midshift_store::Error;
 use projection::LinkProjection;
 use registry::Registry;
+use status_writer::StatusWriter;
 use std::sync::Arc;
 use tokio::sync::{Semaphore, watch};
 use tokio_util::sync::CancellationToken;
@@ -64,8 +66,20 @@ impl TelemetryService {
         let hellos = Arc::new(Semaphore::new(limits::HELLOS_MAX));
         let (event_rates, moving) = (event_rate::EventRates::default(), CancellationToken::new());
         let misreads = misreads::Misreads::default();
-        let inner =
-            Inner { parts, projection, registry, event_rates, misreads, beacons, shared, hellos, moving, shutdown };
+        let status_writer = StatusWriter::default();
+        let inner = Inner {
+            parts,
+            projection,
+            registry,
+            event_rates,
+            misreads,
+            beacons,
+            shared,
+            status_writer,
+            hellos,
+            moving,
+            shutdown,
+        };
         Self { inner: Arc::new(inner) }
     }
     /// With the faces of robots, that of their sessions and the one beside them for old STATUS, and with that of people and programs.
@@ -108,12 +122,16 @@ impl TelemetryService {
     pub fn run(self) -> Boxed<'static, Result<(), Error>> {
         let inner = self.inner;
         Box::pin(async move {
-            tokio::select! {
+            let frames = inner.parts.frames.as_ref();
+            let result = tokio::select! {
                 () = inner.shutdown.cancelled() => Ok(()),
+                () = inner.status_writer.write_groups(frames) => Ok(()),
                 result = projection_feed::follow_rows(&inner) => result,
                 () = presence::write_presence(&inner) => Ok(()),
                 () = shared_heartbeats::keep_heartbeats(inner.shared.as_ref(), &inner.parts.board, &inner.projection) => Ok(()),
-            }
+            };
+            inner.status_writer.finish(frames).await;
+            result
         })
     }
 }

@@ -14,6 +14,7 @@ use midshift_core::site::Site;
 use midshift_core::update::DesiredUpdate;
 use midshift_store::{Dirty, LiveBoard};
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use tokio::sync::watch;
 
@@ -40,7 +41,7 @@ pub struct Rows {
     /// Durable numbers, by row id.
     pub marks: BTreeMap<String, LaneMark>,
     /// Highest durable STATUS number by (robot, ring).
-    pub status: BTreeMap<(RobotId, Arc<str>), u64>,
+    pub status: BTreeMap<(RobotId, Arc<str>), Arc<AtomicU64>>,
     pub(crate) desired: BTreeMap<RobotId, Sections>,
     pub(crate) stops: Arc<SiteStops>,
     /// The map, as fleet keeps it; none: every robot is somewhere on the site.
@@ -51,6 +52,10 @@ impl Rows {
     /// A label of a robot: what people said, or else what it says itself.
     pub fn label(&self, robot_id: &RobotId, key: &str) -> Option<&str> {
         RobotControl::label(self.control.get(robot_id), &self.sessions.get(robot_id)?.inventory, key)
+    }
+    /// Highest durable STATUS number of a ring, 0 if none.
+    pub fn durable_status(&self, robot_id: &RobotId, ring: &Arc<str>) -> u64 {
+        self.status.get(&(robot_id.clone(), ring.clone())).map_or(0, |mark| mark.load(Relaxed))
     }
     /// The area in which a robot is by its newest heartbeat; none: not known.
     pub fn area_of(&self, live: Option<&NewestHeartbeat>) -> Option<&AreaId> {
@@ -83,15 +88,15 @@ impl LinkProjection {
     pub(crate) fn rows_mut(&self) -> RwLockWriteGuard<'_, Rows> {
         self.rows.write().unwrap_or_else(PoisonError::into_inner)
     }
-    /// Notes durable STATUS.
-    pub fn status_durable(&self, robot_id: &RobotId, ring: &Arc<str>, seq: u64) {
-        let mut rows = self.rows_mut();
-        let mark = rows.status.entry((robot_id.clone(), ring.clone())).or_default();
-        *mark = (*mark).max(seq);
-    }
     /// Highest durable STATUS number of a ring, 0 if none.
     pub fn durable_status(&self, robot_id: &RobotId, ring: &Arc<str>) -> u64 {
-        self.rows().status.get(&(robot_id.clone(), ring.clone())).copied().unwrap_or(0)
+        self.rows().durable_status(robot_id, ring)
+    }
+    /// The same, at least `known`, as it rises while more is kept.
+    pub fn status_mark(&self, robot_id: &RobotId, ring: &Arc<str>, known: u64) -> Arc<AtomicU64> {
+        let mark = self.rows_mut().status.entry((robot_id.clone(), ring.clone())).or_default().clone();
+        mark.fetch_max(known, Relaxed);
+        mark
     }
     /// A watch on a robot's desired state, with what stands now.
     pub fn watch(&self, robot_id: &RobotId) -> watch::Receiver<Sections> {

@@ -10,6 +10,7 @@ use midshift_core::stop::record::StopRecord;
 use midshift_store::{Change, Error, Fold, Projection, SkippedRows};
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 use tokio::time::Instant;
 
@@ -149,8 +150,7 @@ async fn load_status(inner: &Inner) {
         Ok(marks) => {
             let mut rows = inner.projection.rows_mut();
             for mark in marks {
-                let known = rows.status.entry((mark.robot_id, mark.ring)).or_default();
-                *known = mark.seq.max(*known);
+                rows.status.entry((mark.robot_id, mark.ring)).or_default().fetch_max(mark.seq, Relaxed);
             }
         }
         Err(error) => {

@@ -15,7 +15,7 @@ use crate::replay::overloaded;
 use crate::shared_heartbeats::{News, Shared};
 use crate::status::{self, Arrived, StatusLane};
 use crate::stops::StopNews;
-use crate::waits::{finish, is_cut_off, next_replay, sleep_until, until_over};
+use crate::waits::{Keeping, await_kept, finish, is_cut_off, next_replay, sleep_until, until_over};
 use crate::welcome::Begun;
 use midshift_core::fleet::REPORT_TOO_LONG;
 use midshift_core::heartbeat::NewestHeartbeat;
@@ -37,8 +37,10 @@ use std::collections::VecDeque;
 use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
+use tokio::sync::oneshot::error::TryRecvError;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 use tonic::{Status, Streaming};
@@ -77,7 +79,10 @@ struct Session {
     /// When a person was told of such a heartbeat; none: of none since one that could be read.
     too_long: Option<Instant>,
     status: StatusLane,
-    keeping: Option<Boxed<Option<u64>>>,
+    /// STATUS that is being kept.
+    keeping: Option<Keeping>,
+    /// How far the ring's STATUS is durable, whichever session brought it.
+    status_mark: Arc<AtomicU64>,
     /// Old STATUS from bulk; none: observed only.
     replays: Option<mpsc::Receiver<Replay>>,
     /// The last number of the batch from there that is being kept, and who waits for it.
@@ -122,8 +127,9 @@ pub async fn run(
     desired.mark_changed();
     let now = inner.parts.clock.now();
     let (in_charge, replays) = begun.part.unzip();
+    let ring: Arc<str> = Arc::from(hello.ring.as_str());
     let mut session = Session {
-        ring: Arc::from(hello.ring.as_str()),
+        ring: ring.clone(),
         epoch,
         in_charge,
         waits: begun.waits,
@@ -132,8 +138,9 @@ pub async fn run(
         committing: None,
         telling: None,
         too_long: None,
-        status: StatusLane::new(robot_id.clone(), Arc::from(hello.ring.as_str()), begun.status),
+        status: StatusLane::new(robot_id.clone(), ring.clone(), begun.status),
         keeping: None,
+        status_mark: inner.projection.status_mark(&robot_id, &ring, begun.status),
         replays,
         replaying: None,
         offset: Offset::default(),
@@ -168,6 +175,9 @@ impl Session {
     ) -> End {
         let fenced = self.in_charge.as_ref().map(|c| c.fenced.clone()).unwrap_or_default();
         let (ends, shutdown) = (self.inner.moving.clone(), self.inner.shutdown.clone());
+        // Made once: a session is woken for each heartbeat.
+        let (shut_down, is_fenced) = (shutdown.cancelled(), fenced.cancelled());
+        tokio::pin!(shut_down, is_fenced);
         // The server goes, or the connection is old.
         let moves = async {
             tokio::select! {
@@ -187,8 +197,8 @@ impl Session {
             let (ack_at, rate_at) = (self.status.ack_at(), self.rate_at());
             tokio::select! {
                 biased;
-                () = shutdown.cancelled() => return close(CloseCode::Shutdown, Code::ShuttingDown, LinkDuration(500)),
-                () = fenced.cancelled() => {
+                () = &mut shut_down => return close(CloseCode::Shutdown, Code::ShuttingDown, LinkDuration(500)),
+                () = &mut is_fenced => {
                     let moved = self.in_charge.as_ref().is_some_and(|c| c.moving.load(Relaxed));
                     let (code, why) = if moved { (CloseCode::MoveOver, Code::MoveOver) } else { (CloseCode::Fenced, Code::Fenced) };
                     return close(code, why, limits::FENCED_RETRY);
@@ -207,7 +217,7 @@ impl Session {
                     self.too_long = None;
                 },
                 outcome = finish(&mut self.committing), if self.committing.is_some() => self.committed(outcome),
-                kept = finish(&mut self.keeping), if self.keeping.is_some() => self.status_kept(kept),
+                is_kept = await_kept(&mut self.keeping), if self.needs_kept() => self.status_written(is_kept),
                 message = up.message() => match message {
                     Ok(Some(message)) => {
                         if let Some(end) = self.take_message(message) {
@@ -236,7 +246,7 @@ impl Session {
                     return close(CloseCode::MoveOver, Code::StoreUnavailable, CUT_OFF_RETRY);
                 }
                 () = sleep_until(unread_at) => return close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)),
-                () = sleep_until(ack_at) => self.ack_status(),
+                () = sleep_until(ack_at) => self.look_for_ack(),
                 () = sleep_until(rate_at) => {}
                 () = sleep_until(moves_until) => return close(CloseCode::MoveOver, Code::MoveOver, LinkDuration(0)),
                 () = &mut moves, if moves_until.is_none() => {
@@ -280,6 +290,9 @@ impl Session {
         let mut out = std::mem::take(&mut self.out);
         if let Some(echo) = &mut out.echo {
             echo.clock.t3_us = self.inner.parts.clock.now().wall.0 * 1000;
+            if self.status.goes_with_echo() {
+                out.acks.push(self.status.ack());
+            }
         }
         out
     }
@@ -447,7 +460,7 @@ impl Session {
 
     fn arrive(&mut self, batch: &LaneBatch) -> Arrived {
         // The session before this one may have kept more since the Welcome was made: neither a hole nor to be kept again.
-        self.status.learn(self.inner.projection.durable_status(&self.robot_id, &self.ring));
+        self.status.learn(self.status_mark.load(Relaxed));
         self.status.arrive(batch, self.inner.parts.clock.now().wall)
     }
 
@@ -476,10 +489,32 @@ impl Session {
         if !asked.is_empty() {
             self.change_out(|out| out.acks.extend(asked));
         }
+        self.look_for_kept();
         if self.keeping.is_none()
             && let Some(write) = self.status.next_write()
         {
-            self.keeping = Some(Box::pin(status::write_frames(self.inner.parts.frames.clone(), write)));
+            let last_seq = write.last_seq();
+            let written = self.inner.status_writer.queue(write, self.status_mark.clone());
+            self.keeping = Some(Keeping { last_seq, is_hurried: false, written });
+        }
+        if self.needs_kept()
+            && let Some(keeping) = self.keeping.as_mut().filter(|keeping| !keeping.is_hurried)
+        {
+            keeping.is_hurried = true;
+            self.inner.status_writer.hurry();
+        }
+    }
+
+    /// Whether somebody waits for what is being kept; else it is enough to look when there is something else to do.
+    fn needs_kept(&self) -> bool {
+        self.keeping.is_some() && (self.replaying.is_some() || self.status.is_half_spent())
+    }
+
+    fn look_for_kept(&mut self) {
+        let written = self.keeping.as_mut().map(|keeping| keeping.written.try_recv());
+        match written {
+            None | Some(Err(TryRecvError::Empty)) => {}
+            Some(written) => self.status_written(written.unwrap_or_default()),
         }
     }
 
@@ -544,24 +579,31 @@ impl Session {
         }
     }
 
-    fn status_kept(&mut self, kept: Option<u64>) {
-        match kept {
-            Some(seq) => {
-                self.inner.projection.status_durable(&self.robot_id, &self.ring, seq);
-                let is_time = self.status.kept(seq);
-                if let Some((_, answer)) = self.replaying.take_if(|(last, _)| self.status.is_kept(*last)) {
-                    drop(answer.send(Ok(self.status.ack())));
-                } else if is_time {
-                    self.ack_status();
-                }
+    fn status_written(&mut self, is_kept: bool) {
+        let Some(Keeping { last_seq, .. }) = self.keeping.take() else { return };
+        if is_kept {
+            self.status.kept(last_seq);
+            if let Some((_, answer)) = self.replaying.take_if(|(last, _)| self.status.is_kept(*last)) {
+                drop(answer.send(Ok(self.status.ack())));
+            } else if self.status.is_half_spent() {
+                self.ack_status();
             }
-            None => {
-                let ack = self.status.lost();
-                if let Some((_, answer)) = self.replaying.take() {
-                    drop(answer.send(Err(Refusal::new(Kind::Unavailable, Code::StoreUnavailable))));
-                }
-                self.change_out(|out| out.acks.push(ack));
+        } else {
+            let ack = self.status.lost();
+            if let Some((_, answer)) = self.replaying.take() {
+                drop(answer.send(Err(Refusal::new(Kind::Unavailable, Code::StoreUnavailable))));
             }
+            self.change_out(|out| out.acks.push(ack));
+        }
+    }
+
+    /// No echo took an acknowledgement along.
+    fn look_for_ack(&mut self) {
+        self.look_for_kept();
+        if self.status.has_ack() {
+            self.ack_status();
+        } else {
+            self.status.look_later();
         }
     }
 

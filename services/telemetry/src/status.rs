@@ -14,16 +14,16 @@ use midshift_core::robot_events::InboxItem;
 use midshift_core::time::Utc;
 use midshift_proto::link::v1;
 use midshift_proto::session::{LaneAck, LaneBatch};
-use midshift_store::{Frame, FrameLog, Gap};
+use midshift_store::{Frame, Gap};
 use prost::Message;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::time::Instant;
 
-/// STATUS is acknowledged at most this often, or at half of its credit.
-const ACK_EVERY: Duration = Duration::from_secs(2);
-/// After a failed write the robot is asked again not sooner than this.
-const RETRY: Duration = Duration::from_millis(200);
+/// STATUS is acknowledged with the first echo after this, or at half of its credit.
+const ACK_AFTER: Duration = Duration::from_millis(1_500);
+/// Without an echo it is acknowledged by itself after this.
+const ACK_WITHIN: Duration = Duration::from_millis(2_500);
 /// STATUS of one session that may wait for the disk, bytes: the credit, and as much again for what the two ends count differently.
 const WAITING_BYTES_MAX: usize = 2 * limits::STATUS_IN_FLIGHT_BYTES;
 
@@ -43,8 +43,21 @@ pub enum Arrived {
 /// What is to be kept together. Written twice after a failure, it says the same twice.
 #[derive(Debug, Default)]
 pub struct Write {
-    frames: Vec<Frame>,
-    gaps: Vec<Gap>,
+    /// Samples, in order.
+    pub frames: Vec<Frame>,
+    /// What will never come.
+    pub gaps: Vec<Gap>,
+}
+
+impl Write {
+    /// What its frames weigh.
+    pub fn bytes(&self) -> usize {
+        self.frames.iter().map(|frame| frame.bytes.len()).sum()
+    }
+    /// Up to which number all is durable once it is kept.
+    pub fn last_seq(&self) -> u64 {
+        self.frames.last().map_or(0, |frame| frame.last_seq)
+    }
 }
 
 /// The STATUS lane of one ring.
@@ -54,11 +67,13 @@ pub struct StatusLane {
     taken: u64,
     durable: u64,
     acked: u64,
+    /// Of what was taken since what was acknowledged.
     unacked_bytes: usize,
     waiting: Write,
     /// Of what waits and of what is being written.
     unkept_bytes: usize,
-    ack_due: Instant,
+    /// Since when there is something to acknowledge, or to look for it.
+    owed_since: Instant,
 }
 
 /// First and last number of an item.
@@ -82,7 +97,7 @@ impl StatusLane {
             unacked_bytes: 0,
             waiting: Write::default(),
             unkept_bytes: 0,
-            ack_due: Instant::now() + ACK_EVERY,
+            owed_since: Instant::now(),
         }
     }
     /// Takes a batch that came at `now`, UTC of the wall.
@@ -110,6 +125,9 @@ impl StatusLane {
         let bytes = wire.encode_to_vec();
         if self.unkept_bytes + bytes.len() > WAITING_BYTES_MAX {
             return Arrived::OverCredit;
+        }
+        if self.taken == self.acked {
+            self.owed_since = Instant::now();
         }
         self.taken = taken;
         self.unacked_bytes += bytes.len();
@@ -144,53 +162,44 @@ impl StatusLane {
     pub fn next_write(&mut self) -> Option<Write> {
         (!self.waiting.frames.is_empty()).then(|| std::mem::take(&mut self.waiting))
     }
-    /// What was written is durable up to here. True: it is time to acknowledge.
-    pub fn kept(&mut self, seq: u64) -> bool {
+    /// What was written is durable up to here.
+    pub fn kept(&mut self, seq: u64) {
         self.durable = self.durable.max(seq);
-        self.unkept_bytes = self.waiting.frames.iter().map(|f| f.bytes.len()).sum();
+        self.unkept_bytes = self.waiting.bytes();
+    }
+    /// Half of the credit is spent: the robot should not wait for an echo.
+    pub fn is_half_spent(&self) -> bool {
         self.unacked_bytes * 2 >= limits::STATUS_IN_FLIGHT_BYTES
     }
     /// It is not: everything since the durable number must come again.
     pub fn lost(&mut self) -> LaneAck {
-        self.taken = self.durable;
+        (self.taken, self.acked) = (self.durable, self.durable);
         self.waiting = Write::default();
-        self.unkept_bytes = 0;
+        (self.unkept_bytes, self.unacked_bytes) = (0, 0);
         LaneAck { lane: Lane::Status, seq: self.durable, expect: Some(self.durable + 1) }
     }
-    /// When to acknowledge at the latest; none: there is nothing to.
+    /// Something is durable that was not acknowledged.
+    pub fn has_ack(&self) -> bool {
+        self.durable > self.acked
+    }
+    /// There is something to acknowledge beside an echo that leaves now.
+    pub fn goes_with_echo(&self) -> bool {
+        self.has_ack() && self.owed_since.elapsed() >= ACK_AFTER
+    }
+    /// When to look for something to acknowledge that no echo took along; none: nothing was taken since.
     pub fn ack_at(&self) -> Option<Instant> {
-        (self.durable > self.acked).then_some(self.ack_due)
+        (self.taken > self.acked).then_some(self.owed_since + ACK_WITHIN)
+    }
+    /// Nothing was durable when it was looked for.
+    pub fn look_later(&mut self) {
+        self.owed_since = Instant::now();
     }
     /// What is durable, as it is acknowledged now.
     pub fn ack(&mut self) -> LaneAck {
         self.acked = self.durable;
-        self.unacked_bytes = 0;
-        self.ack_due = Instant::now() + ACK_EVERY;
+        self.unacked_bytes = self.unkept_bytes;
+        self.owed_since = Instant::now();
         LaneAck { lane: Lane::Status, seq: self.durable, expect: None }
-    }
-}
-
-/// Keeps gaps and frames, gaps first: frames move the mark that says what need not come again. The number up to which all is durable
-/// then, or none if it is not.
-pub async fn write_frames(log: Arc<dyn FrameLog>, write: Write) -> Option<u64> {
-    let last = write.frames.last().map_or(0, |f| f.last_seq);
-    let gaps = write.gaps.len() as u64;
-    let kept = async {
-        if gaps > 0 {
-            log.report_gaps(write.gaps).await?;
-        }
-        log.append(write.frames).await
-    };
-    match kept.await {
-        Ok(()) => {
-            metrics::counter!("midshift_telemetry_status_gaps_total").increment(gaps);
-            Some(last)
-        }
-        Err(error) => {
-            tracing::warn!(%error, "status was not stored");
-            tokio::time::sleep(RETRY).await;
-            None
-        }
     }
 }
 

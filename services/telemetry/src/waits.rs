@@ -5,7 +5,7 @@ use crate::inner::Inner;
 use crate::registry::Replay;
 use midshift_core::Boxed;
 use std::sync::Arc;
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 
 /// The database that several processes share has not been reached for long; never, if there is none.
@@ -40,6 +40,24 @@ pub async fn next_replay(replays: &mut Option<mpsc::Receiver<Replay>>) -> Replay
             Some(replay) => replay,
             None => std::future::pending().await,
         },
+        None => std::future::pending().await,
+    }
+}
+
+/// STATUS of one session that is being kept.
+pub struct Keeping {
+    /// Up to which number.
+    pub last_seq: u64,
+    /// The writer was told not to wait for more.
+    pub is_hurried: bool,
+    /// Whether it is.
+    pub written: oneshot::Receiver<bool>,
+}
+
+/// Whether what is being kept is kept; never, if nothing is.
+pub async fn await_kept(keeping: &mut Option<Keeping>) -> bool {
+    match keeping {
+        Some(keeping) => (&mut keeping.written).await.unwrap_or_default(),
         None => std::future::pending().await,
     }
 }

@@ -137,11 +137,12 @@ async fn mark_of(inner: &Inner, hello: &Hello) -> Result<(LaneMark, Revision), R
 /// Durable STATUS of the robot's ring, which another gateway may have kept.
 async fn status_of(inner: &Inner, hello: &Hello) -> Result<u64, Refusal> {
     let ring: Arc<str> = Arc::from(hello.ring.as_str());
-    if inner.shared.is_some() {
-        let kept = inner.parts.frames.mark(&hello.robot_id, &ring).await.map_err(unavailable)?;
-        inner.projection.status_durable(&hello.robot_id, &ring, kept);
+    let here = inner.projection.durable_status(&hello.robot_id, &ring);
+    if inner.shared.is_none() {
+        return Ok(here);
     }
-    Ok(inner.projection.durable_status(&hello.robot_id, &ring))
+    let kept = inner.parts.frames.mark(&hello.robot_id, &ring).await.map_err(unavailable)?;
+    Ok(kept.max(here))
 }
 
 fn draw_secret() -> SessionSecret {

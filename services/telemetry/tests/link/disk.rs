@@ -12,6 +12,7 @@ pub struct Disk {
     stuck: watch::Sender<bool>,
     full: AtomicBool,
     refused: AtomicU64,
+    written: watch::Sender<u64>,
 }
 
 impl Disk {
@@ -21,6 +22,7 @@ impl Disk {
             stuck: watch::Sender::new(false),
             full: AtomicBool::new(false),
             refused: AtomicU64::new(0),
+            written: watch::Sender::new(0),
         })
     }
     /// From now on nothing gets to the disk, or everything does again.
@@ -34,6 +36,11 @@ impl Disk {
     /// Writes that were refused.
     pub fn refused(&self) -> u64 {
         self.refused.load(Relaxed)
+    }
+    /// Writes of frames that were not refused, once there is one.
+    pub async fn written(&self) -> u64 {
+        // The sender lives as long as this disk.
+        self.written.subscribe().wait_for(|writes| *writes > 0).await.map_or(0, |writes| *writes)
     }
     fn room(&self) -> Result<(), Error> {
         if self.full.load(Relaxed) {
@@ -50,7 +57,9 @@ impl FrameLog for Disk {
         // The sender lives as long as this disk.
         let _ = self.stuck.subscribe().wait_for(|stuck| !stuck).await;
         self.room()?;
-        self.inner.append(frames).await
+        let kept = self.inner.append(frames).await;
+        self.written.send_modify(|writes| *writes += 1);
+        kept
     }
     async fn marks(&self) -> Result<Vec<FrameMark>, Error> {
         self.inner.marks().await

@@ -1,15 +1,18 @@
 //! Lane STATUS: kept as it came, acknowledged in bulk, and never more of it under way than was allowed.
 
 use crate::disk::Disk;
-use crate::world::{Otherwise, Result, Robot, clock, status_samples as samples, world_with};
+use crate::world::{Otherwise, Result, Robot, World, clock, hello, status_samples as samples, world_with};
+use midshift_core::ids::RobotId;
 use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::robot::Lane;
 use midshift_core::robot_events::{Gap, InboxItem};
-use midshift_proto::session::{CloseCode, Downlink};
+use midshift_proto::session::{CloseCode, Downlink, Hello};
 use midshift_store::{FrameLog, MemoryFrames};
 use midshift_telemetry::{Bugs, SeededBug};
 use std::sync::Arc;
+use std::time::Duration;
+use tokio::time::{Instant, advance};
 
 fn disk() -> Arc<Disk> {
     Disk::over(MemoryFrames::new(clock(), 1 << 20))
@@ -108,5 +111,78 @@ async fn acked_without_a_disk(bugs: Bugs) -> Result<bool> {
 async fn status_is_acknowledged_once_it_is_written_and_a_rule_that_does_so_on_arrival_would_lose_it() -> Result<()> {
     assert!(!acked_without_a_disk(Bugs::default()).await?);
     assert!(acked_without_a_disk(Bugs::seeded(&[SeededBug::StatusAckBeforeWrite])).await?);
+    Ok(())
+}
+
+/// As [`Robot::attach`], of this name.
+async fn attach(world: &World, name: &str) -> Result<Robot> {
+    Robot::attach_saying(world, Hello { robot_id: RobotId::parse(name)?, ..hello(None)? }).await
+}
+
+#[tokio::test(start_paused = true)]
+async fn samples_of_many_robots_share_a_write_and_are_acknowledged_beside_an_echo() -> Result<()> {
+    let disk = disk();
+    let world = world_with(otherwise(&disk)).await?;
+    let mut robots = Vec::new();
+    for name in ["r1", "r2", "r3"] {
+        let robot = attach(&world, name).await?;
+        robot.status(samples(1..=1)).await?;
+        robots.push(robot);
+    }
+    let mut acks = vec![None; robots.len()];
+    while acks.contains(&None) {
+        advance(Duration::from_secs(1)).await;
+        for (robot, seq) in robots.iter_mut().zip(&mut acks) {
+            robot.beat().await?;
+            let down = robot.hears(|down| (down.echo.is_some() || !down.acks.is_empty()).then(|| down.clone())).await?;
+            assert!(down.echo.is_some(), "nothing is said but in answer to a heartbeat: {down:?}");
+            *seq = seq.or(acked(&down));
+        }
+    }
+    assert_eq!(acks, [Some(1); 3]);
+    assert_eq!(disk.written().await, 1);
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_is_silent_is_acknowledged_all_the_same() -> Result<()> {
+    let disk = disk();
+    let world = world_with(otherwise(&disk)).await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.status(samples(1..=2)).await?;
+    let begun = Instant::now();
+    assert_eq!(robot.hears(acked).await?, 2);
+    assert!(begun.elapsed() <= Duration::from_secs(3), "{:?}", begun.elapsed());
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_has_spent_half_of_its_credit_waits_neither_for_others_nor_for_an_echo() -> Result<()> {
+    let disk = disk();
+    let world = world_with(otherwise(&disk)).await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    let begun = Instant::now();
+    let batch = limits::SAMPLES_PER_MESSAGE as u64;
+    // A sample takes at least ten bytes.
+    for first in (0..limits::STATUS_IN_FLIGHT_BYTES as u64 / 20).step_by(limits::SAMPLES_PER_MESSAGE) {
+        robot.status(samples(first + 1..=first + batch)).await?;
+    }
+    assert!(robot.hears(acked).await? > 0);
+    assert!(begun.elapsed() < Duration::from_millis(500), "{:?}", begun.elapsed());
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_a_robot_said_right_before_its_connection_was_lost_is_kept() -> Result<()> {
+    let disk = disk();
+    let world = world_with(otherwise(&disk)).await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.status(samples(1..=2)).await?;
+    robot.beat().await?;
+    robot.hears(|down| down.echo).await?;
+    drop(robot);
+    disk.written().await;
+    let kept: Vec<_> = disk.read(0, 1 << 20).await?.iter().map(|f| (f.frame.first_seq, f.frame.last_seq)).collect();
+    assert_eq!(kept, [(1, 2)]);
     Ok(())
 }
