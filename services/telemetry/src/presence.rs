@@ -14,7 +14,6 @@ use midshift_core::rows::{Record, Revision, Writer};
 use midshift_core::time::{LinkDuration, LinkTime, Utc};
 use midshift_store::{Query, Store};
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::time::Duration;
 
 /// How often presence is looked at.
@@ -66,30 +65,33 @@ pub async fn write_presence(inner: &Inner) {
 /// Writes what changed; false: the rows must be read again.
 async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: LinkTime) -> bool {
     let now = inner.parts.clock.now();
-    let heard: BTreeMap<RobotId, Arc<NewestHeartbeat>> = inner.parts.board.all().into_iter().collect();
     // After a start nobody is called offline before the time that it takes to come back.
     let young = now.link.since(started) <= limits::OFFLINE_AFTER;
-    let robots: Vec<RobotId> =
-        known.keys().chain(heard.keys()).cloned().collect::<std::collections::BTreeSet<_>>().into_iter().collect();
-    let changed: Vec<(PresenceRow, Revision)> = robots
-        .into_iter()
-        .filter_map(|robot_id| {
-            let live = heard.get(&robot_id).map(AsRef::as_ref);
-            let presence = Presence::since(live.map(|live| live.processed_at), now.link);
-            let old = known.get(&robot_id);
-            let is_ours = inner.shared.is_none() || inner.registry.is_home(&robot_id);
-            let is_news = |row: &PresenceRow| is_ours && live.is_some_and(|live| is_news(row, live));
-            let is_told = |row: &PresenceRow| row.presence == presence && !is_news(row);
-            let same = old.is_some_and(|(row, _)| row.as_ref().is_none_or(is_told));
-            let too_early = young && live.is_none();
-            if same || too_early || is_others(inner, &robot_id, (presence, now.link), stood) {
-                return None;
-            }
-            let fresh = || PresenceRow::new(robot_id.clone(), Presence::Offline, now.wall.0);
-            let row = old.and_then(|(row, _)| row.clone()).unwrap_or_else(fresh).next(presence, live, now.wall);
-            Some((row, old.map_or(Revision(0), |(_, revision)| *revision)))
-        })
-        .collect();
+    let mut changed: Vec<(PresenceRow, Revision)> = Vec::new();
+    let mut look = |robot_id: &RobotId, live: Option<&NewestHeartbeat>, old: Option<&(Option<PresenceRow>, Revision)>| {
+        let presence = Presence::since(live.map(|live| live.processed_at), now.link);
+        let is_ours = || inner.shared.is_none() || inner.registry.is_home(robot_id);
+        let is_news = |row: &PresenceRow| live.is_some_and(|live| is_news(row, live)) && is_ours();
+        let is_told = |row: &PresenceRow| row.presence == presence && !is_news(row);
+        let same = old.is_some_and(|(row, _)| row.as_ref().is_none_or(is_told));
+        let too_early = young && live.is_none();
+        if same || too_early || is_others(inner, robot_id, (presence, now.link), stood) {
+            return;
+        }
+        let fresh = || PresenceRow::new(robot_id.clone(), Presence::Offline, now.wall.0);
+        let row = old.and_then(|(row, _)| row.clone()).unwrap_or_else(fresh).next(presence, live, now.wall);
+        changed.push((row, old.map_or(Revision(0), |(_, revision)| *revision)));
+    };
+    // Both are by id, and nearly always the same robots.
+    let heard = inner.parts.board.all();
+    let mut rest = known.iter().peekable();
+    for (robot_id, live) in &heard {
+        while let Some((unheard, old)) = rest.next_if(|(known, _)| *known < robot_id) {
+            look(unheard, None, Some(old));
+        }
+        look(robot_id, Some(live), rest.next_if(|(known, _)| *known == robot_id).map(|(_, old)| old));
+    }
+    rest.for_each(|(unheard, old)| look(unheard, None, Some(old)));
     let mut items = Vec::new();
     for rows in changed.chunks(ROWS_PER_ITEM) {
         let mut item = Item::new(Writer::Telemetry, "telemetry");

@@ -32,9 +32,13 @@ pub fn plan(
     plan: &mut Plan,
 ) -> Vec<Candidate> {
     let wanted = !view.queue.is_empty();
-    let mut idle =
-        Pool::on_board(view, board, |r| (wanted || heard.contains(r)) && filters::robot(view, board, r, &now).is_ok());
-    let mut errands = Pool::on_board(view, board, |r| wanted && filters::recallable(view, board, r));
+    let can_work = |r: &RobotId| filters::robot(view, board, r, &now).is_ok();
+    let can_recall = |r: &RobotId| filters::recallable(view, board, r);
+    let (mut idle, mut errands) = if wanted {
+        (Pool::on_board(view, board, board.keys(), can_work), Pool::on_board(view, board, board.keys(), can_recall))
+    } else {
+        (Pool::on_board(view, board, heard, can_work), Pool::default())
+    };
     let present: BTreeSet<RobotId> = idle.robots().chain(errands.robots()).cloned().collect();
     let mut walk = view.queue.walk(&present, heard);
     idle.retain(&walk.robots);

@@ -24,6 +24,7 @@ pub struct Candidate {
 }
 
 /// Robots that tasks are given to one after the other.
+#[derive(Default)]
 pub struct Pool {
     /// By id.
     all: Vec<Candidate>,
@@ -32,12 +33,18 @@ pub struct Pool {
 }
 
 impl Pool {
-    /// Robots of the board for which `can` holds.
-    pub fn on_board(view: &FleetProjection, board: &Board, can: impl Fn(&RobotId) -> bool) -> Self {
-        let known = board.iter().filter(|(id, _)| can(id));
-        let all: Vec<_> = known
-            .filter_map(|(id, live)| {
-                let at = routing::find(view, live.report.vitals.waypoint.as_ref())?;
+    /// Of these robots, by id, those on the board for which `can` holds.
+    pub fn on_board<'a>(
+        view: &FleetProjection,
+        board: &Board,
+        robots: impl IntoIterator<Item = &'a RobotId>,
+        can: impl Fn(&RobotId) -> bool,
+    ) -> Self {
+        let all: Vec<_> = robots
+            .into_iter()
+            .filter(|id| can(id))
+            .filter_map(|id| {
+                let at = routing::find(view, board.get(id)?.report.vitals.waypoint.as_ref())?;
                 let tasks = view.control.get(id.as_str()).map_or(0, |c| c.row.tasks);
                 Some(Candidate { robot_id: id.clone(), at, tasks })
             })

@@ -33,6 +33,11 @@ fn list_own_reasons(report: &ReportedState) -> Vec<Reason> {
     [stop, manual, fault].into_iter().flatten().collect()
 }
 
+/// Whether it says any of that.
+fn is_out_of_work(report: &ReportedState) -> bool {
+    report.hardware_stop != HardwareStop::None || report.mode != Mode::Automatic || report.fault.is_some()
+}
+
 /// The breaker of a robot, if it is open.
 fn breaker(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> {
     let control = view.control.get(robot_id.as_str()).map(|c| &c.row).filter(|c| c.breaker.is_some())?;
@@ -56,8 +61,9 @@ pub(in crate::fleet) fn tell_lasting(view: &mut FleetProjection, board: &Board, 
         .filter_map(|i| Some((i.robot_id.clone()?, i.reason.code)))
         .collect();
     let broken_off = view.control.values().map(|c| &c.row).filter(|c| c.breaker.is_some()).map(|c| &c.robot_id);
+    let out_of_work = board.iter().filter(|(_, live)| is_out_of_work(&live.report)).map(|(robot_id, _)| robot_id);
     let robots: BTreeSet<RobotId> =
-        board.keys().chain(broken_off).chain(open.iter().map(|(robot_id, _)| robot_id)).cloned().collect();
+        out_of_work.chain(broken_off).chain(open.iter().map(|(robot_id, _)| robot_id)).cloned().collect();
     for robot_id in &robots {
         let live = board.get(robot_id);
         // Of what a robot says of itself nobody knows, while it is not heard, that it goes on, nor that it is over.

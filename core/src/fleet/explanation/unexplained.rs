@@ -12,6 +12,7 @@ use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::task::{Phase, TaskState};
 use crate::time::Now;
+use std::cell::OnceCell;
 use std::collections::BTreeMap;
 use std::ops::Bound;
 
@@ -26,12 +27,16 @@ pub(in crate::fleet) fn count_unexplained(view: &mut FleetProjection, board: &Bo
         found.push((format!("robot {id}"), !has_work || why));
     }
     let tasks = next(&view.tasks, &view.unexplained.task);
-    let idle: Vec<&RobotId> = board.keys().filter(|id| filters::robot(view, board, id, &now).is_ok()).collect();
+    // Only for tasks that wait for a robot and nothing else.
+    let idle = OnceCell::new();
+    let find_idle = || board.keys().filter(|id| filters::robot(view, board, id, &now).is_ok()).collect();
     for id in &tasks {
         let task = TaskId::parse(id).ok().and_then(|id| view.task(&id));
-        found.push((format!("task {id}"), task.is_none_or(|task| is_explained(view, board, &now, task, &idle))));
+        let is_explained = |task| is_explained(view, board, &now, task, || idle.get_or_init(find_idle));
+        found.push((format!("task {id}"), task.is_none_or(is_explained)));
     }
-    plan.slice.count_looks(robots.len() + tasks.len() * (1 + idle.len()));
+    let idle = idle.get().map_or(0, Vec::len);
+    plan.slice.count_looks(robots.len() + tasks.len() * (1 + idle));
     (view.unexplained.robot, view.unexplained.task) =
         (robots.into_iter().next_back().unwrap_or_default(), tasks.into_iter().next_back().unwrap_or_default());
     let is_known = |view: &FleetProjection, key: &str| match key.split_once(' ') {
@@ -62,11 +67,17 @@ fn next<R>(rows: &BTreeMap<String, R>, last: &str) -> Vec<String> {
 }
 
 /// A task has a reason, or waits for robots that all have one against it: none that is idle could take it.
-fn is_explained(view: &FleetProjection, board: &Board, now: &Now, task: &TaskState, idle: &[&RobotId]) -> bool {
+fn is_explained<'a>(
+    view: &FleetProjection,
+    board: &Board,
+    now: &Now,
+    task: &TaskState,
+    idle: impl Fn() -> &'a Vec<&'a RobotId>,
+) -> bool {
     let Some(intake) = view.intake(&task.task_id) else { return true };
     match wait_reasons::of_task(view, board, now, task, intake) {
         Some(why) => wait_reasons::is_told(&why),
         None if task.phase != Phase::Queued => false,
-        None => idle.iter().all(|robot_id| filters::pair(view, board, robot_id, task, intake, now).is_err()),
+        None => idle().iter().all(|robot_id| filters::pair(view, board, robot_id, task, intake, now).is_err()),
     }
 }

@@ -205,6 +205,14 @@ impl FleetProjection {
         }
     }
 
+    /// Robots that have an attempt, with it, by id.
+    pub fn robots_at_work(&self) -> impl Iterator<Item = (&RobotId, &AttemptId)> {
+        self.authority.values().filter_map(|authority| match &authority.row.holder {
+            RobotHolder::Attempt(id) => Some((&authority.row.robot_id, id)),
+            RobotHolder::None | RobotHolder::Maintenance(_) => None,
+        })
+    }
+
     /// Drains of the robot, in whatever state.
     pub fn all_drains_of(&self, robot: &RobotId) -> impl Iterator<Item = &Drain> {
         let ids = self.drains_of.get(robot).into_iter().flatten();

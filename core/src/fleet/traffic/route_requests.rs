@@ -31,8 +31,8 @@ pub(super) struct Request {
 /// Requests of all robots that may drive, the first to be served first. Forgets since when robots wait that ask for nothing any more.
 pub(super) fn in_order(view: &mut FleetProjection, board: &Board, now: &Now) -> Vec<Request> {
     let mut requests: Vec<Request> = Vec::new();
-    for (robot_id, live) in board {
-        let Some(id) = view.held_by(robot_id) else { continue };
+    for (robot_id, id) in view.robots_at_work() {
+        let Some(live) = board.get(robot_id) else { continue };
         let Some(a) = view.attempt(id) else { continue };
         if !may_drive(view, a, live, board, now) || plausible::keeps_back(view, live).is_err() {
             continue;
