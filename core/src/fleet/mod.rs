@@ -123,7 +123,9 @@ pub fn cycle(view: &mut FleetProjection, now: Now, board: &Board, pace: Pace, pl
     view.screened.take();
     incidents::open_put_aside(view, now, plan);
     refusals::try_again(view);
-    welcome(view, now, board, plan);
+    if pace == Pace::Sweep || view.authority.len() < view.sessions.len() {
+        welcome(view, now, board, plan);
+    }
     if pace == Pace::Sweep {
         sweep::gather(view, now, board);
     }

@@ -89,9 +89,8 @@ impl StatusWriter {
     pub async fn write_groups(&self, log: &dyn FrameLog) {
         loop {
             self.news.notified().await;
-            let due_at = Instant::now() + LINGER;
             while !self.waiting().queued.is_empty() {
-                self.until_due(due_at).await;
+                self.until_due(Instant::now() + LINGER).await;
                 self.write_group(log).await;
             }
         }

@@ -26,6 +26,9 @@ pub fn undone(view: &mut FleetProjection, decision_key: DecisionKey) {
 /// Looks again at robots of decisions that were undone, or are not aside any more.
 pub(in crate::fleet) fn try_again(view: &mut FleetProjection) {
     let robots = view.refused.take_again();
+    if robots.is_empty() {
+        return;
+    }
     view.compared.retain(|robot_id, _| !robots.contains(robot_id));
     view.dirty.extend(robots.iter().cloned());
     view.policy_dirty.extend(robots);

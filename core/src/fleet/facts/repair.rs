@@ -24,6 +24,8 @@ use crate::robot::{HardwareStop, Mode};
 use crate::robot_events::{AttemptReport, PlaceNews};
 use crate::task::{Attempt, AttemptPhase, Event, Phase};
 use crate::time::Now;
+use std::collections::{BTreeSet, btree_map};
+use std::iter::Peekable;
 
 /// Counts the time in which a robot is heard.
 fn count_attached_time(view: &mut FleetProjection, robot_id: &RobotId, board: &Board, now: &Now) {
@@ -37,11 +39,24 @@ fn count_attached_time(view: &mut FleetProjection, robot_id: &RobotId, board: &B
     time.until = now.site;
 }
 
-/// Whether there is something to compare: a newer heartbeat, one that could not count yet, or none for too long.
-pub fn is_due(view: &FleetProjection, robot_id: &RobotId, board: &Board, now: &Now) -> bool {
-    let online = presence(board, robot_id, now) == Presence::Online;
-    let newest = board.get(robot_id).map(|l| (l.report.session_epoch, l.report.hb));
-    !online || newest.is_none() || view.compared.get(robot_id) != newest.as_ref()
+/// Robots of which there is something to compare: a newer heartbeat, one that could not count yet, or none for too long.
+pub(in crate::fleet) fn find_due(view: &FleetProjection, board: &Board, now: &Now) -> BTreeSet<RobotId> {
+    // Nearly always the same robots, and all by id: one walk instead of two searches for each.
+    let (mut live, mut compared) = (board.iter().peekable(), view.compared.iter().peekable());
+    let known = view.authority.values().map(|authority| &authority.row.robot_id);
+    let is_due = |robot_id: &&RobotId| {
+        let (live, compared) = (seek(&mut live, robot_id), seek(&mut compared, robot_id));
+        let newest = live.map(|live| (live.report.session_epoch, live.report.hb));
+        let is_online = Presence::since(live.map(|live| live.processed_at), now.link) == Presence::Online;
+        !is_online || newest.is_none() || compared != newest.as_ref()
+    };
+    known.filter(is_due).cloned().collect()
+}
+
+/// The row of a robot, which comes after those that were asked for before.
+fn seek<'a, V>(rows: &mut Peekable<btree_map::Iter<'a, RobotId, V>>, robot_id: &RobotId) -> Option<&'a V> {
+    while rows.next_if(|(id, _)| *id < robot_id).is_some() {}
+    rows.next_if(|(id, _)| *id == robot_id).map(|(_, row)| row)
 }
 
 /// Repairs one robot, in items that each stay below their limits however long the robot's lists are.

@@ -21,8 +21,7 @@ pub(in crate::fleet) fn gather(view: &mut FleetProjection, now: Now, board: &Boa
     let (timers, late) = timers::due(view, &now);
     let suspended = view.tasks.values().filter(|t| t.row.phase == Phase::Suspended).map(|t| t.row.task_id.clone());
     let suspended = suspended.collect();
-    let known = view.authority.values().map(|a| &a.row.robot_id);
-    let mut heard: BTreeSet<RobotId> = known.filter(|r| repair::is_due(view, r, board, &now)).cloned().collect();
+    let mut heard = repair::find_due(view, board, &now);
     heard.append(&mut view.agenda.heard);
     view.agenda = Agenda { timers, late, suspended, heard };
     let worn = desired::find_expiring_permissions(view, board);

@@ -222,12 +222,12 @@ fn closed(
 /// Finds robots whose permissions expire while they stand unused.
 pub fn find_expiring_permissions(view: &FleetProjection, board: &Board) -> Vec<RobotId> {
     let worn = |d: &DesiredWork| {
-        let live = board.get(&d.robot_id).map(|l| &**l);
-        if d.held && live.is_some() && !is_held(view, &d.robot_id) {
+        let live = || board.get(&d.robot_id).map(|l| &**l);
+        if d.held && live().is_some() && !is_held(view, &d.robot_id) {
             return true;
         }
-        let entries = d.grants.iter().filter_map(|g| g.entry.as_ref()).chain(d.resume.as_ref());
-        entries.into_iter().any(|a| is_worn(a, live))
+        let mut entries = d.grants.iter().filter_map(|g| g.entry.as_ref()).chain(d.resume.as_ref());
+        entries.any(|a| is_worn(a, live()))
     };
     view.desired_work.values().filter(|d| worn(&d.row)).map(|d| d.row.robot_id.clone()).collect()
 }
