@@ -184,7 +184,7 @@ fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (
         let inventory =
             Inventory { capabilities: vec!["pick".into(), "place".into()], payload_g: 10_000, ..Inventory::default() };
         let session = Session::new(robot_id.clone(), 1, inventory);
-        view.sessions.insert(session.id(), RevisedRow { revision: Revision(1), row: session });
+        view.sessions.insert(session.id().into(), RevisedRow { revision: Revision(1), row: session });
         let waypoint = Some(site.waypoints()[draw(cells)].waypoint_id.clone());
         let vitals = Vitals { waypoint, battery_permille, ..Vitals::default() };
         let live = NewestHeartbeat {

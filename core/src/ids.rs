@@ -1,8 +1,10 @@
 //! Identifiers as types, parsed once on receipt. Called by every crate; nothing here allocates ids at random by itself.
+//!
+//! Short ones lie in their place, so that a map by identifiers is searched without a look elsewhere for each.
 
 use serde::{Deserialize, Serialize};
+use smol_str::SmolStr;
 use std::fmt;
-use std::sync::Arc;
 
 /// An identifier that broke its rule.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -17,7 +19,7 @@ macro_rules! text_id {
         $(#[$doc])*
         #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
         #[serde(try_from = "String", into = "String")]
-        pub struct $name(Arc<str>);
+        pub struct $name(SmolStr);
 
         impl $name {
             /// Parses and checks one identifier; the error says the whole rule.
@@ -26,7 +28,7 @@ macro_rules! text_id {
                 if text.is_empty() || text.len() > $max || !text.chars().all(allowed) {
                     return Err(Error { kind: $kind, rule: $rule });
                 }
-                Ok(Self(Arc::from(text)))
+                Ok(Self(SmolStr::new(text)))
             }
             /// The identifier as text.
             pub fn as_str(&self) -> &str {

@@ -12,6 +12,7 @@ use crate::reason::Reason;
 use crate::rows::{BadRow, Entry, Key, Log, Record, Revision, Row, Table, Writer};
 use crate::time::Now;
 use crate::unknown_rows::UnknownRows;
+use smol_str::SmolStr;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// A row of a projection, with its revision.
@@ -24,7 +25,7 @@ pub struct RevisedRow<R> {
 }
 
 /// Rows of one table by id.
-pub type RowMap<R> = BTreeMap<String, RevisedRow<R>>;
+pub type RowMap<R> = BTreeMap<SmolStr, RevisedRow<R>>;
 
 /// A projection: what one service knows of the rows.
 pub trait Projection: 'static {
@@ -60,7 +61,7 @@ pub fn apply_row<P: Projection, R: Projected<P>>(
     }
     projection.unknown_rows().forget(&key);
     let old = match row.map(|row| (row, row.decode())) {
-        Some((_, Ok(row))) => R::rows(projection).insert(id.to_owned(), RevisedRow { revision, row }),
+        Some((_, Ok(row))) => R::rows(projection).insert(id.into(), RevisedRow { revision, row }),
         Some((row, Err(error))) if error.is_unknown() => {
             projection.unknown_rows().keep_aside(row, &error);
             R::rows(projection).remove(id)
@@ -124,7 +125,7 @@ impl DecisionKey {
 /// Puts a row of a projection back to what it was.
 fn put_back<P: Projection, R: Projected<P>>(projection: &mut P, id: &str, old: Option<RevisedRow<R>>) {
     let was = match old {
-        Some(old) => R::rows(projection).insert(id.to_owned(), old),
+        Some(old) => R::rows(projection).insert(id.into(), old),
         None => R::rows(projection).remove(id),
     };
     R::changed(projection, id, was.as_ref().map(|r| &r.row));
@@ -168,7 +169,7 @@ impl<'a, P: Projection> Tx<'a, P> {
             Expect::Absent => Revision(1),
             Expect::At(known) => known.next(),
         };
-        let old = R::rows(self.view).insert(key.id.to_string(), RevisedRow { revision, row: record });
+        let old = R::rows(self.view).insert((&*key.id).into(), RevisedRow { revision, row: record });
         R::changed(self.view, &key.id, old.as_ref().map(|r| &r.row));
         self.undo.push(Box::new(move |view| put_back::<P, R>(view, &key.id, old)));
     }

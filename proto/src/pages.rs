@@ -17,16 +17,16 @@ pub fn size(asked: u32, bad: &mut Violations) -> usize {
 
 /// One page of rows that come in ascending order of their keys, and the token of the next page, empty after the last. A token is the key of
 /// the last row of the page before, so rows that came or went in between move nothing.
-pub fn page<T>(rows: impl Iterator<Item = (String, T)>, after: &str, size: usize) -> (Vec<T>, String) {
-    let mut rows = rows.skip_while(|(key, _)| !after.is_empty() && key.as_str() <= after);
-    let mut last = String::new();
+pub fn page<K: AsRef<str>, T>(rows: impl Iterator<Item = (K, T)>, after: &str, size: usize) -> (Vec<T>, String) {
+    let mut rows = rows.skip_while(|(key, _)| !after.is_empty() && key.as_ref() <= after);
+    let mut last = None;
     let mut out = Vec::new();
     for (key, row) in rows.by_ref().take(size) {
-        last = key;
+        last = Some(key);
         out.push(row);
     }
-    let next = if rows.next().is_some() { last } else { String::new() };
-    (out, next)
+    let next = last.filter(|_| rows.next().is_some());
+    (out, next.map(|key| key.as_ref().to_owned()).unwrap_or_default())
 }
 
 #[cfg(test)]

@@ -76,7 +76,7 @@ pub fn check(
             row.revision
         }
         Command::CloseIncident { incident_id, .. } => {
-            let found = view.incidents.get(incident_id).filter(|i| i.row.closed.is_none());
+            let found = view.incidents.get(incident_id.as_str()).filter(|i| i.row.closed.is_none());
             let reason = || Reason::from(Code::IncidentNotFound).with("incident_id", incident_id);
             found.ok_or_else(|| Refusal::new(Kind::NotFound, reason()))?.revision
         }
@@ -222,7 +222,7 @@ pub fn note(view: &FleetProjection, command: &Command) -> Note {
         }
         Command::CloseIncident { incident_id, reason } => {
             let note = Note::new("incident.close").about("incident", incident_id).because(reason);
-            let Some(incident) = view.incidents.get(incident_id).map(|i| &i.row) else { return note };
+            let Some(incident) = view.incidents.get(incident_id.as_str()).map(|i| &i.row) else { return note };
             let note = incident.robot_id.iter().fold(note, |note, id| note.about("robot", id));
             let note = incident.task_id.iter().fold(note, |note, id| note.about("task", id));
             incident.area_id.iter().fold(note, |note, id| note.about("area", id))

@@ -79,7 +79,7 @@ fn plan_all(
     }
     let mut moves = 0;
     for id in due_robots(view) {
-        let Some(row) = view.robots.get(&id).map(|r| &r.row) else { continue };
+        let Some(row) = view.robots.get(id.as_str()).map(|r| &r.row) else { continue };
         let Some(rollout) = view.rollout(&row.rollout_id) else { continue };
         let due = due::decide_move(view, board, &now, rollout, row);
         let is_withheld =
@@ -145,13 +145,15 @@ fn due_robots(view: &RolloutProjection) -> Vec<String> {
         ids.extend(view.robots_of(&rollout.rollout_id).map(Record::id));
     }
     let applies = |id: &&String| {
-        let row = view.robots.get(*id).map(|r| &r.row);
+        let row = view.robots.get(id.as_str()).map(|r| &r.row);
         row.and_then(|r| view.rollout(&r.rollout_id)).is_some_and(|rollout| rollout.phase == Phase::Applying)
     };
     ids.extend(view.waiting_out.iter().filter(applies).cloned());
     let mut ids: Vec<String> = ids.into_iter().collect();
     let order = |id: &String| {
-        view.robots.get(id).map(|r| (r.row.rollout_id.clone(), r.row.failure.is_none(), r.row.wave, r.row.rank))
+        view.robots
+            .get(id.as_str())
+            .map(|r| (r.row.rollout_id.clone(), r.row.failure.is_none(), r.row.wave, r.row.rank))
     };
     ids.sort_by_cached_key(order);
     ids

@@ -63,7 +63,7 @@ fn name_robots(view: &RolloutProjection, board: &Board, now: &Now, rollout: &Rol
     let of_rollout = |r: &&RolloutRobot| r.drain_id.is_some() && r.counts();
     let robots: Vec<&RobotId> = match by.code {
         Code::BlockedByBudget => {
-            let area = by.metadata.get("area_id").and_then(|area| view.budgets.get(area));
+            let area = by.metadata.get("area_id").and_then(|area| view.budgets.get(area.as_str()));
             area.map(|area| area.row.off_work.iter().collect()).unwrap_or_default()
         }
         Code::BlockedByTurnInWave => {

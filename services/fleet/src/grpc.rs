@@ -20,6 +20,7 @@ use midshift_proto::convert::{At, parse_ms, timestamp};
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService as Face;
 use midshift_proto::pages;
+use std::ops::Bound;
 use tonic::{Request, Response, Status};
 
 /// Site time after which a drain is given up, unless the caller says another.
@@ -237,11 +238,7 @@ impl FleetService {
                 };
                 let rows = view.places.iter().filter(|(_, p)| !r.in_use || in_use(&p.row));
                 let rows = rows.filter(|(_, p)| sees_place(view, &by, &p.row.place_id));
-                pages::page(
-                    rows.map(|(id, p)| (id.clone(), encode::place(view, &p.row, p.revision))),
-                    &r.page_token,
-                    size,
-                )
+                pages::page(rows.map(|(id, p)| (id, encode::place(view, &p.row, p.revision))), &r.page_token, size)
             })
             .await?;
         Ok(v1::ListPlacesResponse { places, next_page_token })
@@ -341,10 +338,11 @@ impl FleetService {
                     (r.include_closed || i.closed.is_none()) && (robot_id.is_none() || i.robot_id == robot_id)
                 };
                 let prefix = &r.incident_id_prefix;
-                let rows = view.incidents.range(prefix.clone()..).take_while(|(id, _)| id.starts_with(prefix));
+                let rows = view.incidents.range::<str, _>((Bound::Included(prefix.as_str()), Bound::Unbounded));
+                let rows = rows.take_while(|(id, _)| id.starts_with(prefix));
                 let rows = rows.filter(|(_, i)| wanted(&i.row));
                 let rows = rows.filter(|(_, i)| sees_incident(view, board, &by, &i.row));
-                pages::page(rows.map(|(id, i)| (id.clone(), encode::incident(&i.row, i.revision))), &r.page_token, size)
+                pages::page(rows.map(|(id, i)| (id, encode::incident(&i.row, i.revision))), &r.page_token, size)
             })
             .await?;
         Ok(v1::ListIncidentsResponse { incidents, next_page_token })
@@ -354,7 +352,7 @@ impl FleetService {
         let (id, by) = (incident_id.clone(), by.clone());
         let found = self
             .query_projection(move |view, board, _| {
-                let found = view.incidents.get(&id).filter(|i| sees_incident(view, board, &by, &i.row));
+                let found = view.incidents.get(id.as_str()).filter(|i| sees_incident(view, board, &by, &i.row));
                 found.map(|i| encode::incident(&i.row, i.revision))
             })
             .await?;
@@ -384,7 +382,7 @@ impl FleetService {
                 };
                 let rows = view.counters.iter().filter(|(_, c)| wanted(&c.row));
                 let rows = rows.filter(|(_, c)| sees_robot(view, board, &by, &c.row.robot_id));
-                pages::page(rows.map(|(id, c)| (id.clone(), encode::counter(&c.row))), &r.page_token, size)
+                pages::page(rows.map(|(id, c)| (id, encode::counter(&c.row))), &r.page_token, size)
             })
             .await?;
         Ok(v1::ListCountersResponse { counters, next_page_token })

@@ -68,20 +68,21 @@ async fn write(inner: &Inner, known: &mut Known, stood: &mut Stood, started: Lin
     // After a start nobody is called offline before the time that it takes to come back.
     let young = now.link.since(started) <= limits::OFFLINE_AFTER;
     let mut changed: Vec<(PresenceRow, Revision)> = Vec::new();
-    let mut look = |robot_id: &RobotId, live: Option<&NewestHeartbeat>, old: Option<&(Option<PresenceRow>, Revision)>| {
-        let presence = Presence::since(live.map(|live| live.processed_at), now.link);
-        let is_ours = || inner.shared.is_none() || inner.registry.is_home(robot_id);
-        let is_news = |row: &PresenceRow| live.is_some_and(|live| is_news(row, live)) && is_ours();
-        let is_told = |row: &PresenceRow| row.presence == presence && !is_news(row);
-        let same = old.is_some_and(|(row, _)| row.as_ref().is_none_or(is_told));
-        let too_early = young && live.is_none();
-        if same || too_early || is_others(inner, robot_id, (presence, now.link), stood) {
-            return;
-        }
-        let fresh = || PresenceRow::new(robot_id.clone(), Presence::Offline, now.wall.0);
-        let row = old.and_then(|(row, _)| row.clone()).unwrap_or_else(fresh).next(presence, live, now.wall);
-        changed.push((row, old.map_or(Revision(0), |(_, revision)| *revision)));
-    };
+    let mut look =
+        |robot_id: &RobotId, live: Option<&NewestHeartbeat>, old: Option<&(Option<PresenceRow>, Revision)>| {
+            let presence = Presence::since(live.map(|live| live.processed_at), now.link);
+            let is_ours = || inner.shared.is_none() || inner.registry.is_home(robot_id);
+            let is_news = |row: &PresenceRow| live.is_some_and(|live| is_news(row, live)) && is_ours();
+            let is_told = |row: &PresenceRow| row.presence == presence && !is_news(row);
+            let same = old.is_some_and(|(row, _)| row.as_ref().is_none_or(is_told));
+            let too_early = young && live.is_none();
+            if same || too_early || is_others(inner, robot_id, (presence, now.link), stood) {
+                return;
+            }
+            let fresh = || PresenceRow::new(robot_id.clone(), Presence::Offline, now.wall.0);
+            let row = old.and_then(|(row, _)| row.clone()).unwrap_or_else(fresh).next(presence, live, now.wall);
+            changed.push((row, old.map_or(Revision(0), |(_, revision)| *revision)));
+        };
     // Both are by id, and nearly always the same robots.
     let heard = inner.parts.board.all();
     let mut rest = known.iter().peekable();

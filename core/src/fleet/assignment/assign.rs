@@ -4,7 +4,7 @@
 //! assignment alone.
 
 use super::candidates::{Candidate, Pool};
-use super::filters;
+use super::{errands, filters};
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::{RobotControl, TimerKind};
@@ -37,7 +37,8 @@ pub fn plan(
     let (mut idle, mut errands) = if wanted {
         (Pool::on_board(view, board, board.keys(), can_work), Pool::on_board(view, board, board.keys(), can_recall))
     } else {
-        (Pool::on_board(view, board, heard, can_work), Pool::default())
+        let wants_errand = |r: &RobotId| board.get(r).is_some_and(|live| errands::wants_any(view, live)) && can_work(r);
+        (Pool::on_board(view, board, heard, wants_errand), Pool::default())
     };
     let present: BTreeSet<RobotId> = idle.robots().chain(errands.robots()).cloned().collect();
     let mut walk = view.queue.walk(&present, heard);

@@ -10,7 +10,8 @@ use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::attempts;
 use crate::fleet::tasks::transitions::arm;
 use crate::fleet::traffic::anchor::anchor;
-use crate::fleet::traffic::starts;
+use crate::fleet::traffic::{routing, starts};
+use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AttemptId, RobotId, Subject, WaypointId};
 use crate::limits;
 use crate::session::Session;
@@ -64,6 +65,31 @@ impl Coming {
     }
 }
 
+/// What a robot that stands there with this charge would do unless it is given a task.
+struct Wants {
+    charge: bool,
+    /// It stands where it is in others' way.
+    park: bool,
+}
+
+impl Wants {
+    fn new(view: &FleetProjection, here: WaypointIx, battery_permille: u16, waiting: bool) -> Self {
+        let policy = view.policy(&view.site.area_of(here).area_id);
+        let must = battery_permille < policy.charge_mandatory_permille;
+        let may = battery_permille < policy.charge_opportunistic_permille && !waiting;
+        let kind = view.site.waypoint(here).kind;
+        let is_settled = matches!(kind, Kind::Park) || (matches!(kind, Kind::Charger | Kind::Hold) && !waiting);
+        Self { charge: must || may, park: !is_settled && view.site.collisions_modelled() }
+    }
+}
+
+/// Whether an idle robot would do anything while no task waits. Where it would go is not looked for.
+pub(super) fn wants_any(view: &FleetProjection, live: &NewestHeartbeat) -> bool {
+    let vitals = &live.report.vitals;
+    let wants = |here| Wants::new(view, here, vitals.battery_permille, false);
+    routing::find(view, vitals.waypoint.as_ref()).map(wants).is_some_and(|wants| wants.charge || wants.park)
+}
+
 fn wish(
     view: &FleetProjection,
     coming: &Coming,
@@ -73,20 +99,14 @@ fn wish(
     waiting: bool,
 ) -> Option<(Errand, WaypointIx)> {
     let free = |goals: &mut dyn Iterator<Item = WaypointIx>| free(view, coming, robot_id, here, goals);
-    let policy = view.policy(&view.site.area_of(here).area_id);
-    let kind = view.site.waypoint(here).kind;
-    let must = battery_permille < policy.charge_mandatory_permille;
-    let may = battery_permille < policy.charge_opportunistic_permille && !waiting;
-    if (must || may)
+    let wants = Wants::new(view, here, battery_permille, waiting);
+    if wants.charge
         && let Some(charger) = free(&mut view.site.chargers())
     {
         return Some((Errand::Charge, charger));
     }
-    let settled = matches!(kind, Kind::Park) || (matches!(kind, Kind::Charger | Kind::Hold) && !waiting);
-    if settled || !view.site.collisions_modelled() {
-        return None;
-    }
-    park_goal(view, coming, robot_id, here).map(|goal| (Errand::Park, goal))
+    let park = || park_goal(view, coming, robot_id, here).map(|goal| (Errand::Park, goal));
+    wants.park.then(park).flatten()
 }
 
 /// Where a robot that stands at `here` would park; none if it parks already or everything is taken.

@@ -64,7 +64,7 @@ fn check_robots(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
 /// One incident of the site tells of a backlog. It closes by itself, and opens again after a pause.
 pub(in crate::fleet) fn tell_backlog(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     let id = format!("{}:{}", Code::TaskBacklog, view.site.site_id());
-    let known = view.incidents.get(&id).map(|incident| &incident.row);
+    let known = view.incidents.get(id.as_str()).map(|incident| &incident.row);
     let old = view.queue.oldest().filter(|(since, _)| now.ms_since(*since) > limits::BACKLOG_AGE.as_ms());
     match (old, known.map(|incident| &incident.closed)) {
         (None, Some(None)) => {

@@ -20,7 +20,7 @@ pub fn open(tx: &mut Tx, reason: Reason, robot_id: Option<&RobotId>, task_id: Op
     let about = of(robot_id.map(ToString::to_string).or(task_id.map(ToString::to_string)));
     let (first, mut nth) = (format!("{}:{about}:{}", reason.code, tx.now.wall.0), 1);
     let mut id = first.clone();
-    while tx.view.incidents.get(&id).is_some_and(|known| known.row.reason != reason) {
+    while tx.view.incidents.get(id.as_str()).is_some_and(|known| known.row.reason != reason) {
         nth += 1;
         id = format!("{first}:{nth}");
     }

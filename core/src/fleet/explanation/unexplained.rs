@@ -10,10 +10,11 @@ use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{RobotId, TaskId};
 use crate::limits;
+use crate::projection::RowMap;
 use crate::task::{Phase, TaskState};
 use crate::time::Now;
+use smol_str::SmolStr;
 use std::cell::OnceCell;
-use std::collections::BTreeMap;
 use std::ops::Bound;
 
 /// Looks at the next robots and tasks.
@@ -61,9 +62,9 @@ pub(in crate::fleet) fn count_unexplained(view: &mut FleetProjection, board: &Bo
 }
 
 /// The next ids of a table behind the last one that was looked at; from the first on where there are none.
-fn next<R>(rows: &BTreeMap<String, R>, last: &str) -> Vec<String> {
-    let behind = (Bound::Excluded(last.to_owned()), Bound::Unbounded);
-    rows.range(behind).take(limits::UNEXPLAINED_LOOKS).map(|(id, _)| id.clone()).collect()
+fn next<R>(rows: &RowMap<R>, last: &str) -> Vec<SmolStr> {
+    let behind = (Bound::Excluded(last), Bound::Unbounded);
+    rows.range::<str, _>(behind).take(limits::UNEXPLAINED_LOOKS).map(|(id, _)| id.clone()).collect()
 }
 
 /// A task has a reason, or waits for robots that all have one against it: none that is idle could take it.

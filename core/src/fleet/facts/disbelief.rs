@@ -60,7 +60,7 @@ fn incident_of(robot_id: &RobotId) -> String {
 /// # Errors
 /// If neither; the reason says what the robot said.
 pub fn check_believed(view: &FleetProjection, robot_id: &RobotId) -> Result<(), Reason> {
-    let incident = view.incidents.get(&incident_of(robot_id)).map(|i| &i.row);
+    let incident = view.incidents.get(incident_of(robot_id).as_str()).map(|i| &i.row);
     match incident.filter(|i| i.closed.is_none()) {
         Some(open) => Err(open.reason.clone()),
         None => Ok(()),

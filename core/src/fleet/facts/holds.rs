@@ -23,7 +23,7 @@ pub fn resume_token(robot_id: &RobotId) -> String {
 /// The maker's stop makes a hold token of the robot; its release turns that into one that only a person takes away.
 pub fn apply_hardware_stop(tx: &mut Tx, robot_id: &RobotId, stop: HardwareStop) {
     let (stopped, resume) = (stop_token(robot_id), resume_token(robot_id));
-    let stands = tx.view.holds.contains_key(&HoldToken::id_of(robot_id, &stopped));
+    let stands = tx.view.holds.contains_key(HoldToken::id_of(robot_id, &stopped).as_str());
     let since = tx.now.utc;
     if stop != HardwareStop::None && !stands {
         tx.delete::<HoldToken>(&HoldToken::id_of(robot_id, &resume), "hold.replaced");

@@ -141,7 +141,7 @@ pub fn differs(view: &FleetProjection, live: &NewestHeartbeat) -> Option<Reason>
 /// Opens the incident of a robot with another map, and closes it once it has ours.
 pub(in crate::fleet) fn compare(tx: &mut Tx, live: &NewestHeartbeat) {
     let id = format!("{}:{}", Code::MapDiffers, live.robot_id);
-    let open = tx.view.incidents.get(&id).map(|i| &i.row).filter(|i| i.closed.is_none());
+    let open = tx.view.incidents.get(id.as_str()).map(|i| &i.row).filter(|i| i.closed.is_none());
     match (differs(tx.view, live), open.map(|i| &i.reason)) {
         (Some(why), known) if known != Some(&why) => incidents::open_as(tx, id, why, Some(&live.robot_id), None),
         (None, Some(_)) => incidents::close(tx, &id, "the robot drives by the map of the server", "fleet"),
@@ -152,7 +152,7 @@ pub(in crate::fleet) fn compare(tx: &mut Tx, live: &NewestHeartbeat) {
 /// Tells people of what became of the map.
 pub(in crate::fleet) fn tell_of_change(view: &mut FleetProjection, now: Now, change: &MapChange, plan: &mut Plan) {
     let id = format!("{}:{}", Code::MapNotTaken, view.site.site_id());
-    let open = view.incidents.get(&id).map(|i| &i.row).filter(|i| i.closed.is_none()).map(|i| i.reason.clone());
+    let open = view.incidents.get(id.as_str()).map(|i| &i.row).filter(|i| i.closed.is_none()).map(|i| i.reason.clone());
     if let MapChange::NotTaken { version, obstacles } = change {
         let reason = not_taken(view.site.map_version(), version, obstacles);
         if open.as_ref() != Some(&reason) {
@@ -187,7 +187,7 @@ fn not_taken(stored: &str, version: &str, obstacles: &[Obstacle]) -> Reason {
 fn open_forced(tx: &mut Tx, obstacle: &Obstacle) {
     let (kind, name) = obstacle.named();
     let id = format!("{}:{kind}:{name}:{}", Code::MapForced, tx.view.started.wall.0);
-    if tx.view.incidents.contains_key(&id) {
+    if tx.view.incidents.contains_key(id.as_str()) {
         return;
     }
     let reason = Reason::from(Code::MapForced);

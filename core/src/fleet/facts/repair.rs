@@ -132,7 +132,7 @@ fn suspend_to_charge(tx: &mut Tx, robot_id: &RobotId, live: &NewestHeartbeat) {
 fn end_lease(tx: &mut Tx, robot_id: &RobotId, tally: &mut Tally) {
     if tx.view.bugs.timeout_frees_place() {
         for id in transitions::places_of(tx, robot_id) {
-            let holder = tx.view.places.get(&id).and_then(|p| p.row.holder(robot_id).cloned());
+            let holder = tx.view.places.get(id.as_str()).and_then(|p| p.row.holder(robot_id).cloned());
             if let (Some(holder), Ok(place_id)) = (holder, crate::ids::PlaceId::parse(&id)) {
                 inbox::apply_place_news(tx, robot_id, &place_id, holder.grant_id, PlaceNews::Left);
             }

@@ -44,7 +44,7 @@ pub(in crate::fleet) fn carry_out(
     }
     plan.slice.renew();
     while let Some(timer) = view.agenda.timers.pop_if(|_| !plan.is_cut()) {
-        if view.timers.get(&timer.id()).is_some_and(|stands| stands.row == timer) {
+        if view.timers.get(timer.id().as_str()).is_some_and(|stands| stands.row == timer) {
             plan.decide(view, now, "fleet", |tx| timers::fire(tx, &timer, board));
         }
     }

@@ -34,7 +34,7 @@ pub fn request_drain(tx: &mut Tx, robot_id: &RobotId, reason: &str, actor: &str,
     let over: Vec<DrainId> = over.map(|d| d.drain_id.clone()).collect();
     over.iter().for_each(|id| tx.delete::<Drain>(id.as_str(), "drain.forgotten"));
     let wall = tx.now.wall.0.max(0);
-    let free = (0..).map(|n| format!("op:{wall}.{n}")).find(|id| !tx.view.drains.contains_key(id));
+    let free = (0..).map(|n| format!("op:{wall}.{n}")).find(|id| !tx.view.drains.contains_key(id.as_str()));
     let Some(drain_id) = free.and_then(|id| DrainId::parse(&id).ok()) else { return };
     let drain = Drain {
         drain_id,
@@ -85,7 +85,7 @@ pub fn obey_requests(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
             end_drain(tx, &robot_id, &drain_id);
         });
     }
-    let is_new = |id: &&String| !view.drains.contains_key(*id) && !view.drain_releases.contains_key(*id);
+    let is_new = |id: &str| !view.drains.contains_key(id) && !view.drain_releases.contains_key(id);
     let asked: Vec<DrainRequest> =
         view.drain_requests.iter().filter(|(id, _)| is_new(id)).map(|(_, r)| r.row.clone()).collect();
     for request in asked {

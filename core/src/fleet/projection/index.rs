@@ -4,7 +4,7 @@
 //! Invariant: what is derived depends on the rows alone, never on the order in which they came.
 
 use super::queue::{TASKS_PER_TURN, Wait};
-use super::rows::{Drain, HoldToken, Incident, Place, RobotAuthority, RobotControl};
+use super::rows::{Drain, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotHolder};
 use super::state::FleetProjection;
 use crate::ids::{RobotId, TaskId};
 use crate::policy::AreaPolicy;
@@ -116,8 +116,15 @@ impl Indexed<HoldToken> for FleetProjection {
 }
 
 impl Indexed<RobotAuthority> for FleetProjection {
-    fn changed(view: &mut Self, id: &str, _old: Option<&RobotAuthority>) {
-        view.dirty.extend(view.authority.get(id).map(|a| a.row.robot_id.clone()));
+    fn changed(view: &mut Self, id: &str, old: Option<&RobotAuthority>) {
+        let new = view.authority.get(id).map(|a| &a.row);
+        let Some(robot_id) = new.or(old).map(|authority| authority.robot_id.clone()) else { return };
+        if new.is_some_and(|authority| matches!(authority.holder, RobotHolder::Attempt(_))) {
+            view.at_work.insert(robot_id.clone());
+        } else {
+            view.at_work.remove(&robot_id);
+        }
+        view.dirty.extend(new.is_some().then_some(robot_id));
     }
 }
 

@@ -30,7 +30,7 @@ pub fn is_settled(view: &FleetProjection, live: &NewestHeartbeat) -> bool {
     let Some(session) = view.sessions.get(id) else { return false };
     let current = session.row.session_epoch == live.report.session_epoch;
     let applied = view.desired_work.get(id).is_none_or(|d| live.report.applied_work >= d.row.generation);
-    let mark = view.lane_marks.get(&format!("{id}/{}", session.row.ring)).map(|m| &m.row);
+    let mark = view.lane_marks.get(format!("{id}/{}", session.row.ring).as_str()).map(|m| &m.row);
     current && applied && (view.bugs.heartbeat_overtakes_events() || live.is_consumed(mark))
 }
 
@@ -38,7 +38,7 @@ pub fn is_settled(view: &FleetProjection, live: &NewestHeartbeat) -> bool {
 pub fn is_fresh(view: &FleetProjection, live: &NewestHeartbeat) -> bool {
     let id = live.robot_id.as_str();
     let Some(session) = view.sessions.get(id) else { return false };
-    let mark = view.lane_marks.get(&format!("{id}/{}", session.row.ring)).map_or(0, |m| m.row.event);
+    let mark = view.lane_marks.get(format!("{id}/{}", session.row.ring).as_str()).map_or(0, |m| m.row.event);
     live.report.produced.get(&Lane::Event).copied().unwrap_or(0) >= mark
 }
 

@@ -4,6 +4,7 @@ use super::rows::Timer;
 use crate::ids::{RobotId, TaskId};
 use crate::reason::Code;
 use crate::time::LinkTime;
+use smol_str::SmolStr;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// What is due and not done yet. Volatile: the next period gathers it again.
@@ -53,6 +54,6 @@ pub type Lasting = BTreeMap<(RobotId, Code), LinkTime>;
 pub struct Unexplained {
     /// Robots and tasks by since when nobody can say why they stand, link clock; none: counted.
     pub(in crate::fleet) since: BTreeMap<String, Option<LinkTime>>,
-    pub(in crate::fleet) robot: String,
-    pub(in crate::fleet) task: String,
+    pub(in crate::fleet) robot: SmolStr,
+    pub(in crate::fleet) task: SmolStr,
 }

@@ -98,7 +98,7 @@ pub fn permit(view: &FleetProjection, board: &Board, by: &Caller, command: &Comm
             by.authorize_visible(operate, &areas, || missing(Code::PlaceNotFound, "place_id", place_id))
         }
         Command::CloseIncident { incident_id, .. } => {
-            let Some(incident) = view.incidents.get(incident_id) else { return Ok(()) };
+            let Some(incident) = view.incidents.get(incident_id.as_str()) else { return Ok(()) };
             let areas = areas_of_incident(view, board, &incident.row);
             by.authorize_visible(operate, &areas, || missing(Code::IncidentNotFound, "incident_id", incident_id))
         }

@@ -25,6 +25,7 @@ use crate::stop::record::StopRecord;
 use crate::task::{Attempt, Phase, TaskIntake, TaskState};
 use crate::time::{Now, Utc};
 use crate::unknown_rows::UnknownRows;
+use smol_str::format_smolstr;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, OnceLock};
 
@@ -137,6 +138,8 @@ projection! {
         engaged: BTreeSet<String> = BTreeSet::new();
         /// A stop was engaged or reset since tokens were last put right.
         stops_changed: bool = false;
+        /// Robots that have an attempt.
+        at_work: BTreeSet<RobotId> = BTreeSet::new();
         /// Places a robot holds: robot → place ids.
         held_places: BTreeMap<RobotId, BTreeSet<String>> = BTreeMap::new();
         /// Robots whose desired work must be composed again in this cycle.
@@ -194,7 +197,7 @@ impl FleetProjection {
 
     /// The attempt's row.
     pub fn attempt(&self, id: &AttemptId) -> Option<&Attempt> {
-        self.attempts.get(&id.to_string()).map(|a| &a.row)
+        self.attempts.get(id.to_string().as_str()).map(|a| &a.row)
     }
 
     /// The attempt that holds the robot.
@@ -207,16 +210,13 @@ impl FleetProjection {
 
     /// Robots that have an attempt, with it, by id.
     pub fn robots_at_work(&self) -> impl Iterator<Item = (&RobotId, &AttemptId)> {
-        self.authority.values().filter_map(|authority| match &authority.row.holder {
-            RobotHolder::Attempt(id) => Some((&authority.row.robot_id, id)),
-            RobotHolder::None | RobotHolder::Maintenance(_) => None,
-        })
+        self.at_work.iter().filter_map(|robot_id| Some((robot_id, self.held_by(robot_id)?)))
     }
 
     /// Drains of the robot, in whatever state.
     pub fn all_drains_of(&self, robot: &RobotId) -> impl Iterator<Item = &Drain> {
         let ids = self.drains_of.get(robot).into_iter().flatten();
-        ids.filter_map(|id| self.drains.get(id)).map(|d| &d.row)
+        ids.filter_map(|id| self.drains.get(id.as_str())).map(|d| &d.row)
     }
 
     /// The drain that the robot is in: the oldest that takes it out of work.
@@ -226,8 +226,8 @@ impl FleetProjection {
 
     /// Hold tokens of the robot.
     pub fn robot_holds(&self, robot: &RobotId) -> impl Iterator<Item = &HoldToken> {
-        let from = format!("robot:{robot}:");
-        self.holds.range(from.clone()..).take_while(move |(id, _)| id.starts_with(&from)).map(|(_, h)| &h.row)
+        let from = format_smolstr!("robot:{robot}:");
+        self.holds.range(from.clone()..).take_while(move |(id, _)| id.starts_with(&*from)).map(|(_, h)| &h.row)
     }
 
     /// Rules of an area, as they are composed for robots and shown to people.
@@ -247,7 +247,7 @@ pub fn held<'a>(view: &'a FleetProjection, robot_id: &RobotId) -> impl Iterator<
     let robot_id = robot_id.clone();
     let ids = view.held_places.get(&robot_id).into_iter().flatten();
     ids.filter_map(move |id| {
-        let place = &view.places.get(id)?.row;
+        let place = &view.places.get(id.as_str())?.row;
         Some((place, place.holder(&robot_id)?))
     })
 }

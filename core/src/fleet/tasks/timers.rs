@@ -97,7 +97,7 @@ pub(in crate::fleet) fn count_readiness(tx: &mut Tx, task_id: &TaskId) {
     let Some(limit_ms) = tx.view.intake(task_id).and_then(|i| i.spec.schedule_to_start_ms) else { return };
     let since = task.ready_since.map_or(tx.now.utc, |since| since.max(task.queued_since));
     let waiting = AttemptId { subject: Subject::Task(task_id.clone()), epoch: 0 };
-    let known = tx.view.timers.get(&Timer::id_of(TimerKind::ScheduleToStart, &waiting)).map(|t| t.row.clone());
+    let known = tx.view.timers.get(Timer::id_of(TimerKind::ScheduleToStart, &waiting).as_str()).map(|t| t.row.clone());
     let served = tx.view.serving(&tx.now).site_ms;
     let is_ready = tx.view.queue.rank(task_id).is_some();
     match (is_ready, known) {

@@ -177,7 +177,7 @@ fn stop_attempt(tx: &mut Tx, a: &mut Attempt) {
     a.phase = AttemptPhase::Stopping;
     disarm(tx, TimerKind::OfferAck, &a.attempt);
     disarm(tx, TimerKind::StartToClose, &a.attempt);
-    if !tx.view.timers.contains_key(&Timer::id_of(TimerKind::StopConfirm, &a.attempt)) {
+    if !tx.view.timers.contains_key(Timer::id_of(TimerKind::StopConfirm, &a.attempt).as_str()) {
         arm(tx, TimerKind::StopConfirm, &a.attempt, limits::STOP_CONFIRM.as_ms());
     }
 }
@@ -229,7 +229,7 @@ pub fn count_hours(tx: &mut Tx, robot_id: &RobotId) {
 
 /// What the robot has done under this software, with the time in which it was heard since that was last counted.
 fn counter(tx: &mut Tx, robot_id: &RobotId, software: &str) -> RobotCounter {
-    let known = tx.view.counters.get(&format!("{robot_id}@{software}")).map(|c| c.row.clone());
+    let known = tx.view.counters.get(format!("{robot_id}@{software}").as_str()).map(|c| c.row.clone());
     let mut counter = known.unwrap_or_else(|| RobotCounter {
         robot_id: robot_id.clone(),
         software: software.to_owned(),
@@ -248,7 +248,7 @@ fn counter(tx: &mut Tx, robot_id: &RobotId, software: &str) -> RobotCounter {
 /// Takes back every grant the robot has not entered: it stays taken until the robot says so.
 pub fn revoke_unentered(tx: &mut Tx, robot_id: &RobotId) {
     for id in places_of(tx, robot_id) {
-        let Some(mut place) = tx.view.places.get(&id).map(|p| p.row.clone()) else { continue };
+        let Some(mut place) = tx.view.places.get(id.as_str()).map(|p| p.row.clone()) else { continue };
         let Some(holder) =
             place.holders.iter_mut().find(|h| h.robot_id == *robot_id && h.state == HolderState::Granted)
         else {
@@ -262,7 +262,7 @@ pub fn revoke_unentered(tx: &mut Tx, robot_id: &RobotId) {
 /// Closes the places in which the robot may be; where it was only let in it keeps its own seat, and the others go on.
 fn quarantine(tx: &mut Tx, robot_id: &RobotId, why: Option<&Reason>) {
     for id in places_of(tx, robot_id) {
-        let Some(mut place) = tx.view.places.get(&id).map(|p| p.row.clone()) else { continue };
+        let Some(mut place) = tx.view.places.get(id.as_str()).map(|p| p.row.clone()) else { continue };
         let is_whole = place.holder(robot_id).is_some_and(|holder| place.is_closed_whole_by(holder));
         if place.quarantine.is_none() && is_whole {
             let cause = why.map_or(Code::Forced, |r| r.code);
@@ -276,7 +276,7 @@ fn quarantine(tx: &mut Tx, robot_id: &RobotId, why: Option<&Reason>) {
 /// The robot reported: what was closed because nobody knew about it opens again.
 pub fn lift_quarantine(tx: &mut Tx, robot_id: &RobotId) {
     for id in places_of(tx, robot_id) {
-        let Some(mut place) = tx.view.places.get(&id).map(|p| p.row.clone()) else { continue };
+        let Some(mut place) = tx.view.places.get(id.as_str()).map(|p| p.row.clone()) else { continue };
         let ours = place
             .quarantine
             .as_ref()
@@ -450,7 +450,9 @@ fn draw(task_id: &TaskId, epoch: u64) -> f64 {
 /// start_to_close stands still while held.
 fn hold_timer(tx: &mut Tx, t: &TaskState, was: Phase) {
     let Some(id) = t.attempt_id() else { return };
-    let Some(mut timer) = tx.view.timers.get(&Timer::id_of(TimerKind::StartToClose, &id)).map(|t| t.row.clone()) else {
+    let Some(mut timer) =
+        tx.view.timers.get(Timer::id_of(TimerKind::StartToClose, &id).as_str()).map(|t| t.row.clone())
+    else {
         return;
     };
     let served = tx.view.serving(&tx.now).site_ms;

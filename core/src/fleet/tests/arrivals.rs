@@ -210,7 +210,7 @@ type Excuse<'a> = &'a dyn Fn(&mut Rig);
 fn what_nobody_can_tell_is_believed() {
     let older_version = |rig: &mut Rig| {
         let id = attempt(rig).to_string();
-        rig.view.attempts.get_mut(&id).expect("an attempt").row.visited = None;
+        rig.view.attempts.get_mut(id.as_str()).expect("an attempt").row.visited = None;
     };
     let restored = |rig: &mut Rig| {
         Plan::default().decide(&mut rig.view, rig.now, "fleet", |tx| claims::outran(tx, &robot_id(), 9, false));
@@ -308,7 +308,7 @@ fn an_attempt_that_was_taken_is_not_refused_behind_steps_that_were_never_done() 
 fn an_attempt_owes_nothing_of_the_steps_that_one_before_it_did() {
     let mut rig = given();
     let id = attempt(&rig).to_string();
-    let row = &mut rig.view.attempts.get_mut(&id).expect("an attempt").row;
+    let row = &mut rig.view.attempts.get_mut(id.as_str()).expect("an attempt").row;
     row.visited.as_mut().expect("its notes").resume_step = 2;
     row.phase = AttemptPhase::Lost;
     rig.view.desired_work.get_mut("r1").expect("its work").row.assignment = None;
@@ -324,7 +324,7 @@ fn an_attempt_owes_nothing_of_the_steps_that_one_before_it_did() {
 fn an_attempt_that_is_over_is_not_forgotten_before_it_is_judged() {
     let mut rig = given();
     let id = attempt(&rig);
-    rig.view.attempts.get_mut(&id.to_string()).expect("an attempt").row.phase = AttemptPhase::Lost;
+    rig.view.attempts.get_mut(id.to_string().as_str()).expect("an attempt").row.phase = AttemptPhase::Lost;
     let mut task = rig.task("T1").clone();
     task.phase = Phase::NeedsOperator;
     rig.change(&task);
@@ -424,7 +424,7 @@ fn a_given_up_attempt_that_comes_back_as_done_is_held_against_the_steps_that_wer
     for (places, is_believed) in [(vec![], false), (vec!["B"], false), (vec!["A", "B"], true)] {
         let mut rig = given();
         let id = attempt(&rig).to_string();
-        let row = &mut rig.view.attempts.get_mut(&id).expect("an attempt").row;
+        let row = &mut rig.view.attempts.get_mut(id.as_str()).expect("an attempt").row;
         row.phase = AttemptPhase::Lost;
         rig.view.desired_work.get_mut("r1").expect("its work").row.assignment = None;
         let mut task = rig.task("T1").clone();

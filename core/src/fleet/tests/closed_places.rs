@@ -15,7 +15,7 @@ fn silent(state: HolderState) -> Rig {
     rig.submit("T1", |_| {});
     rig.cycle(Pace::Sweep);
     let id = rig.task("T1").attempt_id().expect("given").to_string();
-    let attempt = &mut rig.view.attempts.get_mut(&id).expect("a row").row;
+    let attempt = &mut rig.view.attempts.get_mut(id.as_str()).expect("a row").row;
     (attempt.phase, attempt.ended) = (AttemptPhase::Lost, Some(rig.now.utc));
     let ix = rig.view.site.find_place(&wait_a()).expect("a place");
     let mut place = Place::unheld(rig.view.site.place(ix));

@@ -52,7 +52,7 @@ fn a_stop_manual_mode_and_a_jam_that_last_a_minute_are_incidents_until_they_are_
 fn told_after(rig: &mut Rig, incident_after_ms: u64) {
     let area_id = rig.view.site.areas()[0].area_id.clone();
     let row = AreaPolicy { incident_after_ms, ..AreaPolicy::default_of(area_id) };
-    rig.view.policies.insert(row.id(), RevisedRow { revision: Revision(1), row });
+    rig.view.policies.insert(row.id().into(), RevisedRow { revision: Revision(1), row });
 }
 
 #[test]
@@ -77,7 +77,7 @@ fn an_open_breaker_is_an_incident_until_it_is_reset_also_while_the_robot_is_not_
     let mut rig = Rig::new();
     let robot_id = RobotId::parse("r1").expect("an id");
     let row = RobotControl { breaker: Some(rig.now.utc), ..RobotControl::new(robot_id.clone()) };
-    rig.view.control.insert(row.id(), RevisedRow { revision: Revision(1), row });
+    rig.view.control.insert(row.id().into(), RevisedRow { revision: Revision(1), row });
     assert_eq!(open_after(&mut rig, 60), []);
     assert_eq!(open_after(&mut rig, 1), [Code::RobotBreakerOpened]);
     rig.view.control.get_mut("r1").expect("its row").row.breaker = None;

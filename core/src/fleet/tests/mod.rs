@@ -61,7 +61,7 @@ impl Rig {
         let inventory =
             Inventory { capabilities: vec!["pick".into(), "place".into()], payload_g: 10_000, ..Inventory::default() };
         let session = Session::new(robot_id.clone(), 1, inventory);
-        self.view.sessions.insert(session.id(), RevisedRow { revision: Revision(1), row: session });
+        self.view.sessions.insert(session.id().into(), RevisedRow { revision: Revision(1), row: session });
         let vitals = Vitals { waypoint: WaypointId::parse(waypoint).ok(), battery_permille: 900, ..Vitals::default() };
         let live = NewestHeartbeat {
             robot_id: robot_id.clone(),
@@ -124,7 +124,7 @@ impl Rig {
 
     /// The row as it is after somebody else's write.
     fn change(&mut self, task: &TaskState) {
-        let revision = self.view.tasks.get(&task.id()).expect("a task").revision.next();
+        let revision = self.view.tasks.get(task.id().as_str()).expect("a task").revision.next();
         let row = Row { key: task.key(), revision, index: task.index(), body: task.body() };
         self.view.absorb(&row.key, revision, Some(&row)).expect("a row of ours");
     }

@@ -11,7 +11,7 @@ use std::collections::BTreeSet;
 
 /// Stops that are engaged, as they were copied. What was reset is not looked at.
 pub(in crate::fleet) fn engaged(view: &FleetProjection) -> impl Iterator<Item = &Stop> {
-    view.engaged.iter().filter_map(|id| view.stops.get(id)).map(|record| &record.row.stop)
+    view.engaged.iter().filter_map(|id| view.stops.get(id.as_str())).map(|record| &record.row.stop)
 }
 
 /// Those that stand robots.

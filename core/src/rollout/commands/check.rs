@@ -97,7 +97,7 @@ pub(in crate::rollout) fn check_command(
             Ok(view.software_of(robot_id).device_key.as_ref() == Some(device_key))
         }
         Command::LiftQuarantine { robot_id, bundle } => {
-            let known = view.quarantines.contains_key(&Quarantine::id_of(robot_id, bundle));
+            let known = view.quarantines.contains_key(Quarantine::id_of(robot_id, bundle).as_str());
             if known { Ok(false) } else { Err(not_found(Code::QuarantineNotFound, "robot_id", robot_id)) }
         }
     }

@@ -89,7 +89,7 @@ pub fn permit(view: &RolloutProjection, board: &Board, by: &Caller, command: &Co
         // Which machine is which robot is for whoever administers the site.
         Command::AcceptKey { .. } => by.authorize(Permission::Administer, []),
         Command::LiftQuarantine { robot_id, bundle } => {
-            if !view.quarantines.contains_key(&Quarantine::id_of(robot_id, bundle)) {
+            if !view.quarantines.contains_key(Quarantine::id_of(robot_id, bundle).as_str()) {
                 return Ok(());
             }
             authorize_robot(view, board, by, robot_id, Code::QuarantineNotFound)

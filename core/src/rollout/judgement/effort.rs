@@ -26,7 +26,7 @@ fn count_effort(counter: &RobotCounter) -> Effort {
 pub fn effort_of_robot(view: &RolloutProjection, rollout: &Rollout, robot_id: &RobotId) -> Effort {
     let Some(bundle) = view.bundles.get(rollout.spec.bundle.as_str()) else { return Effort::default() };
     let id = format!("{robot_id}@{}", bundle.row.version);
-    view.counters.get(&id).map_or_else(Effort::default, |counter| count_effort(&counter.row))
+    view.counters.get(id.as_str()).map_or_else(Effort::default, |counter| count_effort(&counter.row))
 }
 
 /// Of all robots with any other version, since ever.

@@ -39,7 +39,7 @@ pub struct Seen {
 pub fn tasks_of_robot(view: &RolloutProjection, rollout: &Rollout, robot_id: &RobotId) -> TaskTally {
     let Some(bundle) = view.bundles.get(rollout.spec.bundle.as_str()) else { return TaskTally::default() };
     let id = format!("{robot_id}@{}", bundle.row.version);
-    view.counters.get(&id).map_or_else(TaskTally::default, |c| ended_tasks(&c.row))
+    view.counters.get(id.as_str()).map_or_else(TaskTally::default, |c| ended_tasks(&c.row))
 }
 
 fn ended_tasks(counter: &RobotCounter) -> TaskTally {

@@ -237,7 +237,7 @@ pub fn may_have(
     if let Some(pin) = software.and_then(|s| s.pin.as_ref()) {
         return Err(pin_reason(pin));
     }
-    if let Some(known) = view.quarantines.get(&Quarantine::id_of(robot_id, &bundle.bundle)) {
+    if let Some(known) = view.quarantines.get(Quarantine::id_of(robot_id, &bundle.bundle).as_str()) {
         return Err(Reason::from(Code::SkippedQuarantined).with("because", known.row.reason.code));
     }
     if !bundle.hardware.contains(&stratum.model) {

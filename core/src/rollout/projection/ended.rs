@@ -94,7 +94,7 @@ impl RolloutProjection {
             open.flat_map(|r| [Some(&r.rollout_id), r.revert_of.as_ref()]).flatten().cloned().collect();
         needed.extend(self.area_bundles.values().flat_map(|a| a.row.rollouts.values()).cloned());
         let mut from = String::new();
-        while let Some(robot) = self.open.range(from..).next().and_then(|id| self.robots.get(id)) {
+        while let Some(robot) = self.open.range(from..).next().and_then(|id| self.robots.get(id.as_str())) {
             let id = &robot.row.rollout_id;
             // Behind all robots of this one.
             from = format!("{id}0");
@@ -132,7 +132,7 @@ impl RolloutProjection {
         let ended = self.rollouts.values().map(|r| &r.row.rollout_id).filter(|id| !needed.contains(*id));
         for id in ended.cloned().collect::<Vec<_>>() {
             for robot in self.robots_of(&id).map(Record::id).collect::<Vec<_>>() {
-                let old = self.robots.remove(&robot);
+                let old = self.robots.remove(robot.as_str());
                 RolloutRobot::changed(self, &robot, old.as_ref().map(|r| &r.row));
             }
             self.rollouts.remove(id.as_str());

@@ -28,6 +28,7 @@ use crate::site::Site;
 use crate::time::{LinkTime, Now};
 use crate::unknown_rows::UnknownRows;
 use crate::update::{DesiredUpdate, UpdateReport};
+use smol_str::format_smolstr;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -174,12 +175,12 @@ impl RolloutProjection {
     }
     /// Robots of a roll-out, by id.
     pub fn robots_of<'a>(&'a self, id: &RolloutId) -> impl Iterator<Item = &'a RolloutRobot> + use<'a> {
-        let (from, to) = (format!("{id}/"), format!("{id}0"));
+        let (from, to) = (format_smolstr!("{id}/"), format_smolstr!("{id}0"));
         self.robots.range(from..to).map(|(_, r)| &r.row)
     }
     /// A robot in a roll-out.
     pub fn robot_of(&self, rollout: &RolloutId, robot: &RobotId) -> Option<&RolloutRobot> {
-        self.robots.get(&RolloutRobot::id_of(rollout, robot)).map(|r| &r.row)
+        self.robots.get(RolloutRobot::id_of(rollout, robot).as_str()).map(|r| &r.row)
     }
     /// A robot in all roll-outs that it is in.
     pub fn rows_of_robot<'a>(&'a self, robot_id: &'a RobotId) -> impl Iterator<Item = &'a RolloutRobot> {
@@ -235,7 +236,7 @@ impl RolloutProjection {
     pub fn is_settled(&self, live: &NewestHeartbeat) -> bool {
         let id = live.robot_id.as_str();
         let Some(session) = self.sessions.get(id) else { return false };
-        let mark = self.lane_marks.get(&format!("{id}/{}", session.row.ring)).map(|m| &m.row);
+        let mark = self.lane_marks.get(format!("{id}/{}", session.row.ring).as_str()).map(|m| &m.row);
         let said = live.report.produced.get(&Lane::Event).copied().unwrap_or(0);
         let is_fresh = said >= mark.map_or(0, |m| m.event);
         session.row.session_epoch == live.report.session_epoch && live.is_consumed(mark) && is_fresh

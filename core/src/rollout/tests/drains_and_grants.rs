@@ -196,7 +196,7 @@ fn robots_that_charge_are_asked_first_and_urgent_drains_do_not_wait() {
         rig.put_row(request(n, false));
     }
     rig.fleet_turn();
-    let state = |rig: &Rig, n: usize| rig.fleet.drains[&format!("ota:{n}")].row.state;
+    let state = |rig: &Rig, n: usize| rig.fleet.drains[format!("ota:{n}").as_str()].row.state;
     assert_eq!([0, 1, 2].map(|n| state(&rig, n)), [DrainState::Waiting, DrainState::Waiting, DrainState::Draining]);
     rig.put_row(crate::drain_request::DrainRequest {
         drain_id: DrainId::parse("ota:9").expect("an id"),
@@ -223,7 +223,7 @@ fn whoever_goes_back_from_an_aborted_bundle_does_not_wait_for_robots_that_only_a
         rig.put_row(request(n, false));
     }
     rig.fleet_turn();
-    let is_on = |rig: &Rig, n: usize| rig.fleet.drains[&format!("ota:{n}")].row.is_on();
+    let is_on = |rig: &Rig, n: usize| rig.fleet.drains[format!("ota:{n}").as_str()].row.is_on();
     assert_eq!([0, 1].map(|n| is_on(&rig, n)), [false, false], "one may be out of work, and one is");
     for n in [3, 4] {
         rig.put_row(crate::drain_request::DrainRequest { is_way_back: true, ..request(n, false) });

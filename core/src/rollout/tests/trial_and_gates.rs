@@ -118,7 +118,7 @@ fn one_failure_among_few_aborts_and_says_how_often_that_happens_to_good_bundles(
     assert_eq!(verdicts(&rig), [(Outcome::Aborted, Code::FailureAmongFew, 1)]);
     assert_eq!(rig.rollout("ro").verdicts[0].robots.false_abort_permille, Some(20));
     rig.until(60, |r| r.phase() == Phase::Aborted);
-    assert!(rig.ota.quarantines.contains_key(&format!("{}/{}", robot_id(n), bundle_id(2))));
+    assert!(rig.ota.quarantines.contains_key(format!("{}/{}", robot_id(n), bundle_id(2)).as_str()));
 }
 
 #[test]

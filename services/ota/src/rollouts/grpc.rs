@@ -345,7 +345,7 @@ impl RolloutService {
         self.ask_projection(move |view, board, _| {
             let rows = view.software.iter().filter(|(id, _)| r.robot_id.is_empty() || **id == r.robot_id);
             let rows = rows.filter(|(_, s)| objects::sees_robot(view, board, &by, &s.row.robot_id));
-            let (rows, next_page_token) = pages::page(rows.map(|(id, s)| (id.clone(), s)), &r.page_token, size);
+            let (rows, next_page_token) = pages::page(rows, &r.page_token, size);
             let software = rows.into_iter().map(|s| encode::software(&s.row)).collect();
             v1::ListRobotSoftwareResponse { software, next_page_token }
         })
@@ -363,7 +363,7 @@ impl RolloutService {
         let by = by.clone();
         self.ask_projection(move |view, board, _| {
             let seen = |q: &&Quarantine| objects::sees_robot(view, board, &by, &q.robot_id);
-            let rows = view.quarantines.iter().filter(|(_, q)| seen(&&q.row)).map(|(id, q)| (id.clone(), q));
+            let rows = view.quarantines.iter().filter(|(_, q)| seen(&&q.row));
             let (rows, next_page_token) = pages::page(rows, &r.page_token, size);
             let quarantines = rows.into_iter().map(|q| encode::quarantine(view, &q.row)).collect();
             v1::ListQuarantinesResponse { quarantines, next_page_token }
@@ -381,7 +381,7 @@ impl RolloutService {
         let command = Command::LiftQuarantine { robot_id: robot_id.clone(), bundle: bundle.clone() };
         let taken = self.act_once(command, by, None, check_only(r.validate_only), request_id).await?;
         self.ask_projection(move |view, _, _| {
-            let quarantine = view.quarantines.get(&Quarantine::id_of(&robot_id, &bundle));
+            let quarantine = view.quarantines.get(Quarantine::id_of(&robot_id, &bundle).as_str());
             let quarantine = quarantine.map(|q| encode::quarantine(view, &q.row));
             v1::LiftQuarantineResponse { done_before: done_before(taken), quarantine }
         })

@@ -20,6 +20,7 @@ use midshift_core::time::Now;
 use midshift_proto::ota::v1;
 use midshift_proto::watches::Teller;
 use std::collections::BTreeMap;
+use std::ops::Bound;
 use std::time::Duration;
 
 /// Messages to one watcher come no faster.
@@ -64,15 +65,15 @@ impl RolloutWatcher {
         let first = self.rollout.is_none();
         let (from, to) = (format!("{id}/"), format!("{id}0"));
         let mut robots = Vec::new();
-        for (key, r) in view.robots.range(from..to) {
+        for (key, r) in view.robots.range::<str, _>((Bound::Included(&*from), Bound::Excluded(&*to))) {
             let shown: Shown = (
                 r.revision,
                 verdict::exposure_of(view, &revised.row, &r.row),
                 encode::progress_permille(board, &r.row),
             );
-            let known = self.robots.get(key) == Some(&shown);
+            let known = self.robots.get(key.as_str()) == Some(&shown);
             if !known && robots.len() < ROBOTS_MAX {
-                self.robots.insert(key.clone(), shown);
+                self.robots.insert(key.to_string(), shown);
                 if !first || !r.row.step.is_over() {
                     robots.push(encode::robot(view, board, now, &revised.row, &r.row));
                 }

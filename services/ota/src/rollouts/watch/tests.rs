@@ -17,8 +17,8 @@ use midshift_proto::ota::v1;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-fn revised<R: Record>(row: R) -> (String, RevisedRow<R>) {
-    (row.id(), RevisedRow { revision: Revision(1), row })
+fn revised<K: From<String>, R: Record>(row: R) -> (K, RevisedRow<R>) {
+    (row.id().into(), RevisedRow { revision: Revision(1), row })
 }
 
 fn bundle(bundle: BundleId) -> Bundle {
