@@ -46,7 +46,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut config = tonic_prost_build::Config::new();
     config.enable_type_names();
     config.skip_debug(with_secrets.iter().map(|message| format!(".{}", message.full_name())));
-    tonic_prost_build::configure().btree_map(".").compile_fds_with_config(set, config)?;
+    let builder = tonic_prost_build::configure().codec_path("crate::codec::SmallCodec").btree_map(".");
+    builder.compile_fds_with_config(set, config)?;
     Ok(())
 }
 

@@ -5,6 +5,7 @@
 
 pub mod access;
 pub mod chunk;
+pub mod codec;
 pub mod convert;
 pub mod denials;
 mod generated;

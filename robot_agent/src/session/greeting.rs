@@ -2,9 +2,9 @@
 //!
 //! Invariant: a session is open only after a welcome. The server's own advice when to ask again is handed on.
 
-use crate::transport::dial::SmallCodec;
 use midshift_core::reason::Code;
 use midshift_core::time::{Clock, LinkDuration, LinkTime};
+use midshift_proto::codec::SmallCodec;
 use midshift_proto::convert::parse;
 use midshift_proto::link::v1;
 use midshift_proto::refusal_of;

@@ -7,7 +7,7 @@
 
 use super::storage::{self, Loaded, StopStorage};
 use super::{CheckIn, StopNews};
-use crate::transport::dial::{Dial, SmallCodec};
+use crate::transport::dial::Dial;
 use crate::transport::repeats::Repeats;
 use midshift_core::Boxed;
 use midshift_core::ids::RobotId;
@@ -16,6 +16,7 @@ use midshift_core::reason::Code;
 use midshift_core::stop::Stop;
 use midshift_core::stop::ladder::Stage;
 use midshift_core::stop::robot::SavedStops;
+use midshift_proto::codec::SmallCodec;
 use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::parse;
 use midshift_proto::convert::stop::{FromStop, names};

@@ -7,7 +7,6 @@ use super::tls::Tls;
 use async_trait::async_trait;
 use hyper_util::rt::TokioIo;
 use std::io;
-use std::marker::PhantomData;
 use std::pin::Pin;
 use std::task::{Context, Poll};
 use std::time::Duration;
@@ -16,16 +15,12 @@ use tokio::net::TcpStream;
 use tokio::sync::watch;
 use tokio_rustls::client::TlsStream;
 use tokio_util::either::Either;
-use tonic::codec::BufferSettings;
 use tonic::transport::{Channel, Endpoint};
-use tonic_prost::{ProstDecoder, ProstEncoder};
 
 /// Stream window of one robot, bytes: enough for the largest control message.
 const STREAM_WINDOW: u32 = 128 * 1024;
 /// Stream window of a download, bytes: what of it may stand before a message of the session on a shared way.
 const BULK_WINDOW: u32 = 64 * 1024;
-/// First size of the codec's buffers, bytes; they grow when they must.
-const CODEC_BYTES: usize = 512;
 /// A connection that is not there by then is tried again, real time.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -78,34 +73,6 @@ pub fn endpoint(uri: &str) -> Result<Endpoint, Error> {
 /// The settings of a connection for downloads: as [`endpoint`], with smaller windows.
 pub fn bulk_endpoint(uri: &str) -> Result<Endpoint, Error> {
     Ok(endpoint(uri)?.initial_stream_window_size(BULK_WINDOW).initial_connection_window_size(BULK_WINDOW))
-}
-
-/// Messages of a line with small first buffers: thousands of robots may live in one process.
-#[derive(Debug)]
-pub(crate) struct SmallCodec<E, D>(PhantomData<(E, D)>);
-
-impl<E, D> Default for SmallCodec<E, D> {
-    fn default() -> Self {
-        Self(PhantomData)
-    }
-}
-
-impl<E, D> tonic::codec::Codec for SmallCodec<E, D>
-where
-    E: prost::Message + Send + 'static,
-    D: prost::Message + Default + Send + 'static,
-{
-    type Encode = E;
-    type Decode = D;
-    type Encoder = ProstEncoder<E>;
-    type Decoder = ProstDecoder<D>;
-
-    fn encoder(&mut self) -> Self::Encoder {
-        ProstEncoder::new(BufferSettings::new(CODEC_BYTES, 32 * 1024))
-    }
-    fn decoder(&mut self) -> Self::Decoder {
-        ProstDecoder::new(BufferSettings::new(CODEC_BYTES, 32 * 1024))
-    }
 }
 
 /// TCP, with a network that may be cut.

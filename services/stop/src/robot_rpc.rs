@@ -8,6 +8,7 @@ use crate::line;
 use bytes::{BufMut, Bytes};
 use midshift_core::limits;
 use midshift_proto::access::caller;
+use midshift_proto::codec::small_buffers;
 use midshift_proto::stop::v1;
 use midshift_proto::{DenialReporter, GoAwayNotice};
 use std::convert::Infallible;
@@ -18,10 +19,7 @@ use tonic::codec::{BufferSettings, Codec, EncodeBuf, Encoder};
 use tonic::codegen::{Body as HttpBody, BoxFuture, Service, StdError, http};
 use tonic::server::{Grpc, NamedService, StreamingService};
 use tonic::{Request, Response, Status, Streaming};
-use tonic_prost::{ProstCodec, ProstDecoder};
-
-/// Bytes of a buffer each way at first, and when it is handed on: a line is quiet, and there are many.
-const BUFFER: (usize, usize) = (512, 32 * 1024);
+use tonic_prost::ProstDecoder;
 
 /// `midshift.stop.v1.StopLinkService`. Cheap to clone.
 #[derive(Clone)]
@@ -40,7 +38,7 @@ impl Codec for Ready {
         AsIs
     }
     fn decoder(&mut self) -> Self::Decoder {
-        ProstCodec::<v1::AttendResponse, v1::AttendRequest>::raw_decoder(BufferSettings::new(BUFFER.0, BUFFER.1))
+        ProstDecoder::new(small_buffers())
     }
 }
 
@@ -53,7 +51,7 @@ impl Encoder for AsIs {
         Ok(())
     }
     fn buffer_settings(&self) -> BufferSettings {
-        BufferSettings::new(BUFFER.0, BUFFER.1)
+        small_buffers()
     }
 }
 

@@ -1,7 +1,7 @@
 //! The robots' face: reads the Hello, sends the Welcome, runs the session.
 
 use crate::facts::count_misread;
-use crate::session::{self, Down};
+use crate::session::{self, Down, Word, word};
 use crate::{TelemetryService, welcome};
 use midshift_core::identity::Caller;
 use midshift_core::ids::RobotId;
@@ -16,6 +16,8 @@ use midshift_proto::{DenialReporter, GoAwayNotice};
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio::time::Instant;
+use tokio_stream::StreamExt;
+use tokio_stream::adapters::Map;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
 use tracing::field::Empty;
@@ -27,7 +29,7 @@ const DOWN_MAX: usize = 16;
 
 #[tonic::async_trait]
 impl LinkService for TelemetryService {
-    type SessionStream = ReceiverStream<Result<v1::SessionResponse, Status>>;
+    type SessionStream = Map<ReceiverStream<Word>, fn(Word) -> Result<v1::SessionResponse, Status>>;
 
     async fn session(
         &self,
@@ -49,12 +51,12 @@ impl LinkService for TelemetryService {
                     if let Err(refusal) = result
                         && !shutdown.is_cancelled()
                     {
-                        let _ = down.send(Err(midshift_proto::status(&refusal, None))).await;
+                        let _ = down.send(Box::new(Err(midshift_proto::status(&refusal, None)))).await;
                     }
                 }
             }
         });
-        Ok(Response::new(ReceiverStream::new(stream)))
+        Ok(Response::new(ReceiverStream::new(stream).map(|word| *word)))
     }
 }
 
@@ -87,7 +89,8 @@ impl TelemetryService {
         }
         let room = self.inner.hellos.clone().try_acquire_owned().map_err(|_| crowded(rand::random()))?;
         self.inner.projection.ready().await;
-        let begun = welcome::begin(&self.inner, &hello, by).await?;
+        // Elsewhere: its state is no session's once it is over.
+        let begun = Box::pin(welcome::begin(&self.inner, &hello, by)).await?;
         drop(room);
         tracing::info!(peer = Empty, robot_id = %hello.robot_id, session_epoch = begun.welcome.session_epoch, observed = begun.welcome.observed, "session begun");
         let (robot_id, epoch) = (hello.robot_id.clone(), begun.welcome.session_epoch);
@@ -98,8 +101,7 @@ impl TelemetryService {
             self.inner.registry.observe(&robot_id, since);
             self.inner.projection.touch(&robot_id);
         }
-        let message = ToRobot::Welcome(begun.welcome.clone());
-        if down.send(Ok((&message).into())).await.is_err() {
+        if down.send(word(&ToRobot::Welcome(begun.welcome.clone()))).await.is_err() {
             return Ok(());
         }
         session::run(self.inner.clone(), &hello, begun, go_away, up, down).await;

@@ -60,8 +60,15 @@ const UNECHOED_MAX: usize = 16;
 
 type Boxed<T> = Pin<Box<dyn Future<Output = T> + Send>>;
 
-/// Sends one message; false if the robot is gone.
-pub type Down = mpsc::Sender<Result<v1::SessionResponse, Status>>;
+/// A message down, or why there is none. Elsewhere: a queue has room for many from its first on.
+pub type Word = Box<Result<v1::SessionResponse, Status>>;
+/// To one robot.
+pub type Down = mpsc::Sender<Word>;
+
+/// A message as it goes down.
+pub fn word(message: &ToRobot) -> Word {
+    Box::new(Ok(message.into()))
+}
 
 struct Session {
     inner: Arc<Inner>,
@@ -161,7 +168,7 @@ pub async fn run(
         if close.code == CloseCode::Protocol && session.in_charge.is_some() {
             count_misread(&inner, &robot_id, close.reason.text());
         }
-        let _ = down.try_send(Ok((&ToRobot::Close(close)).into()));
+        let _ = down.try_send(word(&ToRobot::Close(close)));
     }
 }
 
@@ -205,7 +212,7 @@ impl Session {
                 }
                 permit = down.reserve(), if waits => match permit {
                     Ok(permit) => {
-                        permit.send(Ok((&ToRobot::Downlink(Box::new(self.stamp()))).into()));
+                        permit.send(word(&ToRobot::Downlink(Box::new(self.stamp()))));
                         self.out_since = None;
                     }
                     Err(_) => return End::Gone,
@@ -273,8 +280,7 @@ impl Session {
         if let Some(in_charge) = &self.in_charge {
             in_charge.moving.store(true, Relaxed);
         }
-        let message = ToRobot::MoveOver { within_ms: MOVE_OVER_WITHIN.as_millis() as u32 };
-        let _ = down.try_send(Ok((&message).into()));
+        let _ = down.try_send(word(&ToRobot::MoveOver { within_ms: MOVE_OVER_WITHIN.as_millis() as u32 }));
     }
 
     fn change_out(&mut self, change: impl FnOnce(&mut Downlink)) {

@@ -6,8 +6,6 @@ use crate::{code, dependencies, files, manifests, package, read, root, short, ta
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// Crates that no source names, and why they are needed all the same.
-const UNNAMED: &[(&str, &str, &str)] = &[("midshift-proto", "tonic-prost", "the code that its build script writes")];
 /// The library of a crate, where it has another name than the crate.
 const LIBRARIES: &[(&str, &str)] = &[("rustls-webpki", "webpki")];
 
@@ -47,8 +45,7 @@ fn needless(manifest: &toml::Table, section: &str, sources: &str) -> Vec<String>
         let known = LIBRARIES.iter().find(|(known, _)| *known == dependency);
         known.map_or_else(|| dependency.replace('-', "_"), |(_, library)| (*library).to_owned())
     };
-    let unnamed = |dependency: &str| UNNAMED.iter().any(|(ours, known, _)| *ours == name && *known == dependency);
-    let missing = of_section.filter(|dependency| !names(sources, &library(dependency)) && !unnamed(dependency));
+    let missing = of_section.filter(|dependency| !names(sources, &library(dependency)));
     missing.map(|dependency| format!("{name} -> {dependency}")).collect()
 }
 
