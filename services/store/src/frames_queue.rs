@@ -3,13 +3,14 @@
 //! Invariant: nobody is told "durable" before the commit of the engine ([`FramesEngine`]) has returned.
 
 use crate::frames::{DAYS_MS, is_aged};
-use crate::frames_pack::{coarser, pack, unpack};
+use crate::frames_pack::{RowCompressor, coarser, pack, unpack};
 use crate::queue::closed;
 use crate::{Coarsen, Error, Frame, FrameMark, FramesOldest, Gap, StoredFrame};
 use midshift_core::ids::RobotId;
 use midshift_core::privacy::PRECISE_MS;
 use midshift_core::time::Utc;
 use sqlx::{ColumnIndex, Decode, Type};
+use std::io;
 use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
 
@@ -18,7 +19,7 @@ const QUEUE_COMMANDS: usize = 1_024;
 /// Rows of one page of [`crate::FrameLog::read`].
 pub(crate) const READ_ROWS: i64 = 64;
 /// One `frame_log` row holds about so many bytes and samples; one transaction so many bytes.
-const ROW_BYTES: usize = 64 * 1024;
+pub(crate) const ROW_BYTES: usize = 64 * 1024;
 const ROW_SAMPLES: u64 = 2_000;
 const GROUP_BYTES: usize = 1024 * 1024;
 /// Gaps kept, newest first.
@@ -66,7 +67,7 @@ pub(crate) struct Packed {
 
 /// Serves the queue until it is closed or nobody can ask any more.
 pub(crate) async fn run(mut engine: impl FramesEngine, mut queue: mpsc::Receiver<Command>) {
-    let mut put_back = None;
+    let (mut put_back, mut compressor) = (None, None);
     loop {
         let command = match put_back.take() {
             Some(command) => command,
@@ -79,7 +80,7 @@ pub(crate) async fn run(mut engine: impl FramesEngine, mut queue: mpsc::Receiver
         match command {
             Command::Append { frames, reply } => {
                 let (frames, replies) = gather(frames, reply, &mut queue, &mut put_back);
-                let outcome = match packed(&frames) {
+                let outcome = match packed(&frames, &mut compressor) {
                     Ok(rows) => engine.append(&frames, &rows).await,
                     Err(error) => Err(error),
                 };
@@ -124,7 +125,7 @@ fn gather(
     (frames, replies)
 }
 
-fn packed(frames: &[Frame]) -> Result<Vec<Packed>, Error> {
+fn packed(frames: &[Frame], compressor: &mut Option<RowCompressor>) -> Result<Vec<Packed>, Error> {
     let mut rows: Vec<Packed> = Vec::new();
     for frame in frames {
         if rows.last().is_none_or(|row| row.body.len() >= ROW_BYTES || row.samples >= ROW_SAMPLES) {
@@ -134,6 +135,14 @@ fn packed(frames: &[Frame]) -> Result<Vec<Packed>, Error> {
             pack(frame, &mut row.body).map_err(|error| Error::Unavailable(Arc::new(error)))?;
             row.samples += frame.last_seq.saturating_sub(frame.first_seq) + 1;
         }
+    }
+    let no_row = |error: io::Error| Error::Unavailable(Arc::new(error));
+    let compressor = match compressor {
+        Some(compressor) => compressor,
+        None => compressor.insert(RowCompressor::new().map_err(no_row)?),
+    };
+    for row in &mut rows {
+        row.body = compressor.row(std::mem::take(&mut row.body)).map_err(no_row)?;
     }
     Ok(rows)
 }
