@@ -7,6 +7,8 @@ use midshift_core::rows::{Key, Log, Revision, Seq, Table, Writer};
 use midshift_store::{
     Error, Frame, FrameLog, Gap, MemoryFrames, OpenError, PostgresFrames, SqliteFrames, SqliteStore, Store,
 };
+use rand::rngs::StdRng;
+use rand::{Rng, SeedableRng};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -66,9 +68,12 @@ async fn a_data_directory_is_made_for_its_owner_alone() {
     assert!(again.iter().all(|file| file.applied.is_empty()), "{again:?}");
 }
 
+/// A frame of so many bytes that do not become fewer by compressing them.
 fn frame(robot: &str, first_seq: u64, last_seq: u64, bytes: usize) -> Frame {
     let robot_id = RobotId::parse(robot).unwrap();
-    Frame { robot_id, ring: Arc::from("ring"), first_seq, last_seq, bytes: vec![7; bytes].into() }
+    let mut body = vec![0; bytes];
+    StdRng::seed_from_u64(first_seq).fill_bytes(&mut body);
+    Frame { robot_id, ring: Arc::from("ring"), first_seq, last_seq, bytes: body.into() }
 }
 
 fn gap(robot: &str, from_seq: u64) -> Gap {
