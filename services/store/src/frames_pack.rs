@@ -4,7 +4,6 @@
 //! Layout, all little-endian: u8 length and robot_id, u8 length and ring, u64 first, u64 last, u32 length and bytes. Before what is compressed, by
 //! zstd, stand a zero, which is no robot's length, and its length in a u32. What would not be smaller, and what 0.2.0 wrote, is as it is.
 
-use crate::frames_queue::ROW_BYTES;
 use crate::{Coarsen, Frame};
 use midshift_core::ids::RobotId;
 use midshift_core::limits;
@@ -13,6 +12,8 @@ use std::io;
 use std::sync::Arc;
 use zstd::bulk::Compressor;
 
+/// A row is full with so many bytes, before it is compressed.
+pub(crate) const ROW_BYTES: usize = 64 * 1024;
 /// The fastest: samples of a fleet are alike.
 const LEVEL: i32 = 1;
 /// First byte of a row that is compressed.

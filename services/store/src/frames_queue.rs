@@ -3,7 +3,7 @@
 //! Invariant: nobody is told "durable" before the commit of the engine ([`FramesEngine`]) has returned.
 
 use crate::frames::{DAYS_MS, is_aged};
-use crate::frames_pack::{RowCompressor, coarser, pack, unpack};
+use crate::frames_pack::{ROW_BYTES, RowCompressor, coarser, pack, unpack};
 use crate::queue::closed;
 use crate::{Coarsen, Error, Frame, FrameMark, FramesOldest, Gap, StoredFrame};
 use midshift_core::ids::RobotId;
@@ -18,8 +18,7 @@ use tokio::sync::{mpsc, oneshot};
 const QUEUE_COMMANDS: usize = 1_024;
 /// Rows of one page of [`crate::FrameLog::read`].
 pub(crate) const READ_ROWS: i64 = 64;
-/// One `frame_log` row holds about so many bytes and samples; one transaction so many bytes.
-pub(crate) const ROW_BYTES: usize = 64 * 1024;
+/// Samples of one `frame_log` row, and bytes of one transaction, about.
 const ROW_SAMPLES: u64 = 2_000;
 const GROUP_BYTES: usize = 1024 * 1024;
 /// Gaps kept, newest first.

@@ -23,6 +23,7 @@ mod registry;
 mod replay;
 mod retention;
 mod session;
+mod session_status;
 mod shared_heartbeats;
 mod status;
 mod status_writer;

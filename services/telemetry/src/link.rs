@@ -132,6 +132,8 @@ impl Drop for Leave<'_> {
     fn drop(&mut self) {
         let inner = &self.service.inner;
         inner.event_rates.leave(self.robot_id, Instant::now());
+        // Its next session looks how far this one has kept.
+        inner.status_writer.hurry();
         match self.observed {
             Some(since) => {
                 inner.registry.lose_sight(self.robot_id, since);

@@ -11,9 +11,8 @@ use crate::inner::Inner;
 use crate::offset::Offset;
 use crate::projection::Sections;
 use crate::registry::{InCharge, Replay};
-use crate::replay::overloaded;
 use crate::shared_heartbeats::{News, Shared};
-use crate::status::{self, Arrived, StatusLane};
+use crate::status::StatusLane;
 use crate::stops::StopNews;
 use crate::waits::{Keeping, await_kept, finish, is_cut_off, next_replay, sleep_until, until_over};
 use crate::welcome::Begun;
@@ -22,7 +21,7 @@ use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::ids::RobotId;
 use midshift_core::item::{Fact, Item};
 use midshift_core::limits;
-use midshift_core::reason::{Code, Kind, Reason, Refusal};
+use midshift_core::reason::{Code, Reason, Refusal};
 use midshift_core::robot::Lane;
 use midshift_core::robot_events::{InboxEntry, InboxItem};
 use midshift_core::rows::{Log, Writer};
@@ -40,7 +39,6 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
-use tokio::sync::oneshot::error::TryRecvError;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 use tonic::{Status, Streaming};
@@ -70,12 +68,13 @@ pub fn word(message: &ToRobot) -> Word {
     Box::new(Ok(message.into()))
 }
 
-struct Session {
-    inner: Arc<Inner>,
-    robot_id: RobotId,
+/// A session under way.
+pub(crate) struct Session {
+    pub(crate) inner: Arc<Inner>,
+    pub(crate) robot_id: RobotId,
     ring: Arc<str>,
     epoch: u64,
-    in_charge: Option<InCharge>,
+    pub(crate) in_charge: Option<InCharge>,
     /// What ends it; none: nothing does.
     waits: Option<Waits>,
     events: Events,
@@ -85,15 +84,15 @@ struct Session {
     telling: Option<Boxed<bool>>,
     /// When a person was told of such a heartbeat; none: of none since one that could be read.
     too_long: Option<Instant>,
-    status: StatusLane,
+    pub(crate) status: StatusLane,
     /// STATUS that is being kept.
-    keeping: Option<Keeping>,
+    pub(crate) keeping: Option<Keeping>,
     /// How far the ring's STATUS is durable, whichever session brought it.
-    status_mark: Arc<AtomicU64>,
+    pub(crate) status_mark: Arc<AtomicU64>,
     /// Old STATUS from bulk; none: observed only.
     replays: Option<mpsc::Receiver<Replay>>,
     /// The last number of the batch from there that is being kept, and who waits for it.
-    replaying: Option<(u64, oneshot::Sender<Result<LaneAck, Refusal>>)>,
+    pub(crate) replaying: Option<(u64, oneshot::Sender<Result<LaneAck, Refusal>>)>,
     offset: Offset,
     progress: (u64, SiteTime),
     /// The map that the robot said last.
@@ -110,12 +109,13 @@ struct Session {
 }
 
 /// Why the loop ends.
-enum End {
+pub(crate) enum End {
     Gone,
     Close(Close),
 }
 
-fn close(code: CloseCode, reason: Code, retry_after: LinkDuration) -> End {
+/// Ends a session with a reason.
+pub(crate) fn close(code: CloseCode, reason: Code, retry_after: LinkDuration) -> End {
     End::Close(Close { code, reason: Reason::from(reason), retry_after_ms: retry_after.as_ms() as u32 })
 }
 
@@ -283,7 +283,7 @@ impl Session {
         let _ = down.try_send(word(&ToRobot::MoveOver { within_ms: MOVE_OVER_WITHIN.as_millis() as u32 }));
     }
 
-    fn change_out(&mut self, change: impl FnOnce(&mut Downlink)) {
+    pub(crate) fn change_out(&mut self, change: impl FnOnce(&mut Downlink)) {
         change(&mut self.out);
         // What says nothing is not sent, and nobody is too slow for it.
         if self.out != Downlink::default() {
@@ -446,44 +446,6 @@ impl Session {
         }
     }
 
-    fn status(&mut self, batch: &LaneBatch) -> Option<End> {
-        self.in_charge.as_ref()?;
-        match self.arrive(batch) {
-            Arrived::Taken if self.inner.parts.bugs.status_ack_before_write() => {
-                let seq = batch.items.iter().map(|item| status::numbers(item).1).max().unwrap_or(0);
-                self.change_out(|out| out.acks.push(LaneAck { lane: Lane::Status, seq, expect: None }));
-            }
-            Arrived::Taken => {}
-            Arrived::Known => self.ack_status(),
-            Arrived::Expect(ack) => self.change_out(|out| out.acks.push(ack)),
-            Arrived::OverCredit => {
-                tracing::warn!(peer = Empty, robot_id = %self.robot_id, "session ended by status beyond its credit");
-                return Some(close(CloseCode::TooSlow, Code::Overloaded, LinkDuration(1_000)));
-            }
-        }
-        None
-    }
-
-    fn arrive(&mut self, batch: &LaneBatch) -> Arrived {
-        // The session before this one may have kept more since the Welcome was made: neither a hole nor to be kept again.
-        self.status.learn(self.status_mark.load(Relaxed));
-        self.status.arrive(batch, self.inner.parts.clock.now().wall)
-    }
-
-    /// Old STATUS that came over bulk: the same lane, the same rules, and another way for the answer.
-    fn replay(&mut self, replay: Replay) {
-        let last = replay.batch.items.iter().map(|item| status::numbers(item).1).max().unwrap_or(0);
-        // Whoever asked may have stopped waiting; what was taken is kept all the same.
-        match self.arrive(&replay.batch) {
-            Arrived::Taken | Arrived::Known if !self.status.is_kept(last) => {
-                self.replaying = Some((last, replay.answer));
-            }
-            Arrived::Taken | Arrived::Known => drop(replay.answer.send(Ok(self.status.ack()))),
-            Arrived::Expect(ack) => drop(replay.answer.send(Ok(ack))),
-            Arrived::OverCredit => drop(replay.answer.send(Err(overloaded()))),
-        }
-    }
-
     /// Begins the writes that wait, at most one of each kind at a time.
     fn start_writes(&mut self) {
         if self.committing.is_none()
@@ -495,33 +457,7 @@ impl Session {
         if !asked.is_empty() {
             self.change_out(|out| out.acks.extend(asked));
         }
-        self.look_for_kept();
-        if self.keeping.is_none()
-            && let Some(write) = self.status.next_write()
-        {
-            let last_seq = write.last_seq();
-            let written = self.inner.status_writer.queue(write, self.status_mark.clone());
-            self.keeping = Some(Keeping { last_seq, is_hurried: false, written });
-        }
-        if self.needs_kept()
-            && let Some(keeping) = self.keeping.as_mut().filter(|keeping| !keeping.is_hurried)
-        {
-            keeping.is_hurried = true;
-            self.inner.status_writer.hurry();
-        }
-    }
-
-    /// Whether somebody waits for what is being kept; else it is enough to look when there is something else to do.
-    fn needs_kept(&self) -> bool {
-        self.keeping.is_some() && (self.replaying.is_some() || self.status.is_half_spent())
-    }
-
-    fn look_for_kept(&mut self) {
-        let written = self.keeping.as_mut().map(|keeping| keeping.written.try_recv());
-        match written {
-            None | Some(Err(TryRecvError::Empty)) => {}
-            Some(written) => self.status_written(written.unwrap_or_default()),
-        }
+        self.keep_status();
     }
 
     /// The next events to keep, as many as the robot's rate allows.
@@ -583,38 +519,5 @@ impl Session {
                 self.change_out(|out| out.acks.extend(again));
             }
         }
-    }
-
-    fn status_written(&mut self, is_kept: bool) {
-        let Some(Keeping { last_seq, .. }) = self.keeping.take() else { return };
-        if is_kept {
-            self.status.kept(last_seq);
-            if let Some((_, answer)) = self.replaying.take_if(|(last, _)| self.status.is_kept(*last)) {
-                drop(answer.send(Ok(self.status.ack())));
-            } else if self.status.is_half_spent() {
-                self.ack_status();
-            }
-        } else {
-            let ack = self.status.lost();
-            if let Some((_, answer)) = self.replaying.take() {
-                drop(answer.send(Err(Refusal::new(Kind::Unavailable, Code::StoreUnavailable))));
-            }
-            self.change_out(|out| out.acks.push(ack));
-        }
-    }
-
-    /// No echo took an acknowledgement along.
-    fn look_for_ack(&mut self) {
-        self.look_for_kept();
-        if self.status.has_ack() {
-            self.ack_status();
-        } else {
-            self.status.look_later();
-        }
-    }
-
-    fn ack_status(&mut self) {
-        let ack = self.status.ack();
-        self.change_out(|out| out.acks.push(ack));
     }
 }

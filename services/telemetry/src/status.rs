@@ -58,6 +58,31 @@ impl Write {
     pub fn last_seq(&self) -> u64 {
         self.frames.last().map_or(0, |frame| frame.last_seq)
     }
+    /// Leaves out all up to a number that is known.
+    pub fn leave_out(&mut self, seq: u64) {
+        self.frames.retain_mut(|frame| {
+            if frame.first_seq <= seq
+                && let Ok(mut wire) = v1::LaneBatch::decode(&*frame.bytes)
+            {
+                frame.first_seq = seq + 1;
+                leave_out(&mut wire, seq);
+                frame.bytes = Arc::from(wire.encode_to_vec());
+            }
+            frame.first_seq <= frame.last_seq
+        });
+        self.gaps.retain_mut(|gap| {
+            gap.from_seq = gap.from_seq.max(seq + 1);
+            gap.from_seq <= gap.to_seq
+        });
+    }
+}
+
+fn leave_out(wire: &mut v1::LaneBatch, seq: u64) {
+    wire.samples.retain(|sample| sample.seq > seq);
+    wire.gaps.retain_mut(|gap| {
+        gap.from_seq = gap.from_seq.max(seq + 1);
+        gap.from_seq <= gap.to_seq
+    });
 }
 
 /// The STATUS lane of one ring.
@@ -121,6 +146,7 @@ impl StatusLane {
         }
         let Some(first_seq) = first else { return Arrived::Known };
         let mut wire = v1::LaneBatch::from(batch);
+        leave_out(&mut wire, self.taken);
         coarsen_late(&mut wire, now);
         let bytes = wire.encode_to_vec();
         if self.unkept_bytes + bytes.len() > WAITING_BYTES_MAX {

@@ -1,12 +1,13 @@
 //! STATUS of all sessions on its way to the frame log: gathered for a while, so that one commit keeps the samples of many robots.
 //!
 //! Invariant: a write is called kept only after the commit that holds it; gaps come before frames, which move the mark that says what need not come
-//! again. Nothing is gathered for longer than [`LINGER`], and not at all for who cannot wait.
+//! again. Each number is written once, also if a session brings again what the one before it had handed over. Nothing is gathered for longer than
+//! [`LINGER`], and not at all for who cannot wait.
 
 use crate::status::Write;
 use midshift_store::{Error, FrameLog};
-use std::sync::atomic::AtomicU64;
-use std::sync::atomic::Ordering::Relaxed;
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 use tokio::sync::{Notify, oneshot};
@@ -111,6 +112,7 @@ impl StatusWriter {
     }
     async fn write_group(&self, log: &dyn FrameLog) {
         let mut group = self.waiting().take_group();
+        leave_out_known(&mut group);
         let kept = write(log, &mut group).await;
         if let Err(error) = &kept {
             tracing::warn!(%error, "status was not stored");
@@ -118,6 +120,7 @@ impl StatusWriter {
         }
         for queued in group {
             if kept.is_ok() {
+                // Nothing of what was left out is beyond the mark.
                 queued.mark.fetch_max(queued.write.last_seq(), Relaxed);
             }
             // The session may be over; its mark is for the next one.
@@ -126,13 +129,27 @@ impl StatusWriter {
     }
 }
 
+/// Leaves out what is kept, or stands in the group before.
+fn leave_out_known(group: &mut [Queued]) {
+    let mut known: BTreeMap<*const AtomicU64, u64> = BTreeMap::new();
+    for Queued { write, mark, .. } in group {
+        let seq = known.entry(Arc::as_ptr(mark)).or_insert_with(|| mark.load(Relaxed));
+        let last_seq = write.last_seq();
+        write.leave_out(*seq);
+        *seq = last_seq.max(*seq);
+    }
+}
+
 async fn write(log: &dyn FrameLog, group: &mut [Queued]) -> Result<(), Error> {
     let gaps: Vec<_> = group.iter_mut().flat_map(|queued| std::mem::take(&mut queued.write.gaps)).collect();
-    let frames = group.iter().flat_map(|queued| queued.write.frames.iter().cloned()).collect();
+    let frames: Vec<_> = group.iter().flat_map(|queued| queued.write.frames.iter().cloned()).collect();
     if !gaps.is_empty() {
         let count = gaps.len() as u64;
         log.report_gaps(gaps).await?;
         metrics::counter!("midshift_telemetry_status_gaps_total").increment(count);
+    }
+    if frames.is_empty() {
+        return Ok(());
     }
     log.append(frames).await
 }

@@ -145,6 +145,28 @@ async fn samples_of_many_robots_share_a_write_and_are_acknowledged_beside_an_ech
 }
 
 #[tokio::test(start_paused = true)]
+async fn what_a_session_brings_again_that_the_one_before_handed_over_is_kept_once() -> Result<()> {
+    let disk = disk();
+    let world = world_with(otherwise(&disk)).await?;
+    disk.stick(true);
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.status(samples(1..=2)).await?;
+    robot.beat().await?;
+    robot.hears(|down| down.echo).await?;
+    let mut next = Robot::attach(&world, Some(robot.proof())).await?;
+    let reason = Code::Overflow.into();
+    let gap = InboxItem::Gap(Gap { lane: Lane::Status, from_seq: 1, to_seq: 3, reason });
+    next.status(std::iter::once(gap).chain(samples(4..=5)).collect()).await?;
+    disk.stick(false);
+    while next.hears(acked).await? < 5 {}
+    let kept: Vec<_> = disk.read(0, 1 << 20).await?.iter().map(|f| (f.frame.first_seq, f.frame.last_seq)).collect();
+    assert_eq!(kept, [(1, 2), (3, 5)]);
+    let gaps: Vec<_> = disk.gaps(None, 10).await?.iter().map(|gap| (gap.from_seq, gap.to_seq)).collect();
+    assert_eq!(gaps, [(3, 3)]);
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_robot_that_is_silent_is_acknowledged_all_the_same() -> Result<()> {
     let disk = disk();
     let world = world_with(otherwise(&disk)).await?;
