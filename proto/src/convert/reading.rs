@@ -158,6 +158,10 @@ pub(crate) fn text(value: String, max: usize, at: At<'_>, bad: &mut Violations) 
         bad.add(at.to_string(), format!("is required, 1-{max} bytes"));
         return None;
     }
+    if value.contains('\0') {
+        bad.add(at.to_string(), "must not contain a zero byte");
+        return None;
+    }
     Some(value)
 }
 

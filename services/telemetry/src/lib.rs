@@ -119,7 +119,7 @@ impl TelemetryService {
             }
         })
     }
-    /// Keeps the projection of rows and the presence of robots until shutdown.
+    /// Keeps the projection of rows, the presence of robots and what they bring of STATUS until shutdown.
     pub fn run(self) -> Boxed<'static, Result<(), Error>> {
         let inner = self.inner;
         Box::pin(async move {

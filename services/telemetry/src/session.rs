@@ -134,6 +134,7 @@ pub async fn run(
     desired.mark_changed();
     let now = inner.parts.clock.now();
     let (in_charge, replays) = begun.part.unzip();
+    let is_observed = in_charge.is_none();
     let ring: Arc<str> = Arc::from(hello.ring.as_str());
     let mut session = Session {
         ring: ring.clone(),
@@ -147,7 +148,12 @@ pub async fn run(
         too_long: None,
         status: StatusLane::new(robot_id.clone(), ring.clone(), begun.status),
         keeping: None,
-        status_mark: inner.projection.status_mark(&robot_id, &ring, begun.status),
+        // Of one that is only observed nothing is kept.
+        status_mark: if is_observed {
+            Arc::default()
+        } else {
+            inner.projection.status_mark(&robot_id, &ring, begun.status)
+        },
         replays,
         replaying: None,
         offset: Offset::default(),
@@ -224,7 +230,7 @@ impl Session {
                     self.too_long = None;
                 },
                 outcome = finish(&mut self.committing), if self.committing.is_some() => self.committed(outcome),
-                is_kept = await_kept(&mut self.keeping), if self.needs_kept() => self.status_written(is_kept),
+                is_kept = await_kept(&mut self.keeping), if self.awaits_kept() => self.status_written(is_kept),
                 message = up.message() => match message {
                     Ok(Some(message)) => {
                         if let Some(end) = self.take_message(message) {

@@ -65,7 +65,7 @@ impl Session {
             let written = self.inner.status_writer.queue(write, self.status_mark.clone());
             self.keeping = Some(Keeping { last_seq, is_hurried: false, written });
         }
-        if (self.needs_kept() || self.is_moving())
+        if self.is_urgent()
             && let Some(keeping) = self.keeping.as_mut().filter(|keeping| !keeping.is_hurried)
         {
             keeping.is_hurried = true;
@@ -73,14 +73,15 @@ impl Session {
         }
     }
 
-    /// Its next session may begin at another gateway, which looks how far this one has kept.
-    fn is_moving(&self) -> bool {
-        self.in_charge.as_ref().is_some_and(|in_charge| in_charge.moving.load(Relaxed))
+    /// Somebody waits for what is being kept: the robot for its credit, a replay, or another gateway that will look how far this session came.
+    fn is_urgent(&self) -> bool {
+        let is_moving = self.in_charge.as_ref().is_some_and(|in_charge| in_charge.moving.load(Relaxed));
+        self.replaying.is_some() || self.status.is_half_spent() || is_moving
     }
 
-    /// Whether somebody waits for what is being kept; else it is enough to look when there is something else to do.
-    pub(crate) fn needs_kept(&self) -> bool {
-        self.keeping.is_some() && (self.replaying.is_some() || self.status.is_half_spent())
+    /// Whether to be woken when it is kept; else it is enough to look when there is something else to do.
+    pub(crate) fn awaits_kept(&self) -> bool {
+        self.keeping.is_some() && (self.is_urgent() || self.status.has_more())
     }
 
     fn look_for_kept(&mut self) {

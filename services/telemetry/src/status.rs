@@ -204,6 +204,10 @@ impl StatusLane {
         (self.unkept_bytes, self.unacked_bytes) = (0, 0);
         LaneAck { lane: Lane::Status, seq: self.durable, expect: Some(self.durable + 1) }
     }
+    /// Something waits behind what is being kept.
+    pub fn has_more(&self) -> bool {
+        !self.waiting.frames.is_empty()
+    }
     /// Something is durable that was not acknowledged.
     pub fn has_ack(&self) -> bool {
         self.durable > self.acked

@@ -1,8 +1,8 @@
 //! STATUS of all sessions on its way to the frame log: gathered for a while, so that one commit keeps the samples of many robots.
 //!
 //! Invariant: a write is called kept only after the commit that holds it; gaps come before frames, which move the mark that says what need not come
-//! again. Each number is written once, also if a session brings again what the one before it had handed over. Nothing is gathered for longer than
-//! [`LINGER`], and not at all for who cannot wait.
+//! again. One process writes each sample that it kept once, also if a session brings again what the one before it had handed over. A write waits for
+//! others for [`LINGER`] once the one before it is done, and not at all for who cannot wait. What the log refuses takes no other write with it.
 
 use crate::status::Write;
 use midshift_store::{Error, FrameLog};
@@ -17,6 +17,8 @@ use tokio::time::{Instant, sleep, sleep_until};
 pub const LINGER: Duration = Duration::from_millis(500);
 /// So many bytes are written at once, and do not wait for more.
 const GROUP_BYTES: usize = 1024 * 1024;
+/// With so many, what sessions that are over have left is let go: their robots bring it again.
+const WAITING_BYTES_MAX: usize = 64 * 1024 * 1024;
 /// After a failed write, robots are asked again not sooner than this.
 const RETRY: Duration = Duration::from_millis(200);
 
@@ -27,10 +29,23 @@ struct Queued {
     done: oneshot::Sender<bool>,
 }
 
+impl Queued {
+    fn answer(self, is_kept: bool) {
+        if is_kept {
+            // Nothing of what was left out is beyond the mark.
+            self.mark.fetch_max(self.write.last_seq(), Relaxed);
+        }
+        // The session may be over; its mark is for the next one.
+        let _ = self.done.send(is_kept);
+    }
+}
+
 #[derive(Default)]
 struct Waiting {
     queued: Vec<Queued>,
     bytes: usize,
+    /// With so many bytes it is looked for what may be let go; twice what stayed, so that it is not looked for each time.
+    is_full_at: usize,
     /// Somebody cannot wait for more.
     is_hurried: bool,
 }
@@ -38,6 +53,15 @@ struct Waiting {
 impl Waiting {
     fn is_due(&self) -> bool {
         self.is_hurried || self.bytes >= GROUP_BYTES
+    }
+    /// Lets go what sessions that are over have left, once there is much.
+    fn limit(&mut self) {
+        if self.bytes <= self.is_full_at.max(WAITING_BYTES_MAX) {
+            return;
+        }
+        self.queued.retain(|queued| !queued.done.is_closed());
+        self.bytes = self.queued.iter().map(|queued| queued.write.bytes()).sum();
+        self.is_full_at = 2 * self.bytes;
     }
     /// What is written next; the rest is due if it is as much again or somebody is in a hurry.
     fn take_group(&mut self) -> Vec<Queued> {
@@ -66,13 +90,14 @@ impl StatusWriter {
     fn waiting(&self) -> MutexGuard<'_, Waiting> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
-    /// Takes a write; `mark` rises to its last number once it is kept. The answer: whether it is; none: nobody writes any more.
+    /// Takes a write; `mark` rises to its last number once it is kept. The answer: whether it is.
     pub fn queue(&self, write: Write, mark: Arc<AtomicU64>) -> oneshot::Receiver<bool> {
         let (done, answer) = oneshot::channel();
         let mut waiting = self.waiting();
         let is_first = waiting.queued.is_empty();
         waiting.bytes += write.bytes();
         waiting.queued.push(Queued { write, mark, done });
+        waiting.limit();
         if is_first || waiting.is_due() {
             self.news.notify_one();
         }
@@ -92,14 +117,21 @@ impl StatusWriter {
             self.news.notified().await;
             while !self.waiting().queued.is_empty() {
                 self.until_due(Instant::now() + LINGER).await;
-                self.write_group(log).await;
+                let group = self.waiting().take_group();
+                // Each was told how it went.
+                let _ = write_group(log, group).await;
             }
         }
     }
-    /// Writes what waits, at the end of all.
+    /// Writes what waits at this moment, at the end of all, unless the log fails.
     pub async fn finish(&self, log: &dyn FrameLog) {
-        while !self.waiting().queued.is_empty() {
-            self.write_group(log).await;
+        let mut left = self.waiting().queued.len();
+        while left > 0 {
+            let group = self.waiting().take_group();
+            left = left.saturating_sub(group.len().max(1));
+            if write_group(log, group).await.is_err() {
+                return;
+            }
         }
     }
     async fn until_due(&self, due_at: Instant) {
@@ -110,23 +142,28 @@ impl StatusWriter {
             }
         }
     }
-    async fn write_group(&self, log: &dyn FrameLog) {
-        let mut group = self.waiting().take_group();
-        leave_out_known(&mut group);
-        let kept = write(log, &mut group).await;
-        if let Err(error) = &kept {
-            tracing::warn!(%error, "status was not stored");
-            sleep(RETRY).await;
-        }
+}
+
+/// Writes a group, and says so to each.
+async fn write_group(log: &dyn FrameLog, mut group: Vec<Queued>) -> Result<(), Error> {
+    leave_out_known(&mut group);
+    let kept = write(log, &group).await;
+    if let Err(Error::BadFrame(why)) = &kept
+        && group.len() > 1
+    {
+        tracing::warn!(why, "status is stored one write at a time");
         for queued in group {
-            if kept.is_ok() {
-                // Nothing of what was left out is beyond the mark.
-                queued.mark.fetch_max(queued.write.last_seq(), Relaxed);
-            }
-            // The session may be over; its mark is for the next one.
-            let _ = queued.done.send(kept.is_ok());
+            let kept = write(log, std::slice::from_ref(&queued)).await;
+            queued.answer(kept.is_ok());
         }
+        return Ok(());
     }
+    if let Err(error) = &kept {
+        tracing::warn!(%error, "status was not stored");
+        sleep(RETRY).await;
+    }
+    group.into_iter().for_each(|queued| queued.answer(kept.is_ok()));
+    kept
 }
 
 /// Leaves out what is kept, or stands in the group before.
@@ -140,8 +177,8 @@ fn leave_out_known(group: &mut [Queued]) {
     }
 }
 
-async fn write(log: &dyn FrameLog, group: &mut [Queued]) -> Result<(), Error> {
-    let gaps: Vec<_> = group.iter_mut().flat_map(|queued| std::mem::take(&mut queued.write.gaps)).collect();
+async fn write(log: &dyn FrameLog, group: &[Queued]) -> Result<(), Error> {
+    let gaps: Vec<_> = group.iter().flat_map(|queued| queued.write.gaps.iter().cloned()).collect();
     let frames: Vec<_> = group.iter().flat_map(|queued| queued.write.frames.iter().cloned()).collect();
     if !gaps.is_empty() {
         let count = gaps.len() as u64;
@@ -152,4 +189,48 @@ async fn write(log: &dyn FrameLog, group: &mut [Queued]) -> Result<(), Error> {
         return Ok(());
     }
     log.append(frames).await
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::ids::RobotId;
+    use midshift_core::time::{ScaledClock, Utc};
+    use midshift_store::{Frame, MemoryFrames};
+
+    fn write_of(ring: &str, bytes: usize) -> Write {
+        let robot_id = RobotId::parse("r1").expect("an id");
+        let frame = Frame { robot_id, ring: Arc::from(ring), first_seq: 1, last_seq: 3, bytes: vec![0; bytes].into() };
+        Write { frames: vec![frame], gaps: Vec::new() }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn what_the_log_refuses_takes_no_other_write_with_it() {
+        let log = MemoryFrames::new(Arc::new(ScaledClock::new(|| 0, Utc(0), 1000)), 1 << 20);
+        let (writer, marks) = (StatusWriter::default(), [(); 3].map(|()| Arc::new(AtomicU64::new(0))));
+        let rings = ["one", "no\0name", "other"];
+        let kept: Vec<_> =
+            rings.iter().zip(&marks).map(|(ring, mark)| writer.queue(write_of(ring, 9), mark.clone())).collect();
+        writer.finish(&log).await;
+        let mut answers = Vec::new();
+        for kept in kept {
+            answers.push(kept.await.expect("an answer"));
+        }
+        assert_eq!(answers, [true, false, true]);
+        assert_eq!(marks.map(|mark| mark.load(Relaxed)), [3, 0, 3]);
+        assert_eq!(log.read(0, usize::MAX).await.expect("frames").len(), 2);
+    }
+
+    #[test]
+    fn what_sessions_that_are_over_have_left_does_not_grow_without_bound() {
+        let (writer, mark) = (StatusWriter::default(), Arc::new(AtomicU64::new(0)));
+        let living = writer.queue(write_of("living", 1024), mark.clone());
+        for _ in 0..WAITING_BYTES_MAX / 1024 {
+            drop(writer.queue(write_of("over", 1024), mark.clone()));
+        }
+        let waiting = writer.waiting();
+        assert!(waiting.bytes <= 4096, "{} bytes", waiting.bytes);
+        assert!(waiting.queued.iter().any(|queued| &*queued.write.frames[0].ring == "living"));
+        drop((waiting, living));
+    }
 }

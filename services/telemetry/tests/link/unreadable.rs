@@ -7,7 +7,7 @@ use midshift_core::reason::Code;
 use midshift_core::robot::ReportedState;
 use midshift_core::rows::{Log, Seq};
 use midshift_proto::link::v1::{SessionRequest, SessionResponse, session_request};
-use midshift_proto::session::{Close, CloseCode, FromRobot, Heartbeat, ToRobot, Uplink};
+use midshift_proto::session::{Close, CloseCode, FromRobot, Heartbeat, Hello, ToRobot, Uplink};
 use prost::Message;
 use prost::bytes::Bytes;
 use std::time::Duration;
@@ -48,6 +48,15 @@ fn heartbeat_of_no_text() -> Result<Vec<u8>> {
     let at = bytes.windows(4).position(|four| four == b"~~~~").ok_or("its map is in it")?;
     bytes[at] = 0xff;
     Ok(bytes)
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_ring_with_a_zero_byte_is_refused_as_no_log_would_take_its_samples() -> Result<()> {
+    let world = world().await?;
+    let hello = bytes_of(&FromRobot::Hello(Box::new(Hello { ring: "ri\0ng".to_owned(), ..hello(None)? })));
+    let refused = last_word(says(&world, vec![hello]).await?).await.expect_err("no session");
+    assert!(refused.to_string().contains("ring must not contain a zero byte"), "{refused}");
+    Ok(())
 }
 
 #[tokio::test(start_paused = true)]
