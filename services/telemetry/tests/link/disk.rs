@@ -42,6 +42,15 @@ impl Disk {
         // The sender lives as long as this disk.
         self.written.subscribe().wait_for(|writes| *writes > 0).await.map_or(0, |writes| *writes)
     }
+    /// Waits until all up to this number is kept.
+    pub async fn has(&self, seq: u64) -> Result<(), Error> {
+        let mut written = self.written.subscribe();
+        while self.inner.marks().await?.iter().all(|mark| mark.seq < seq) {
+            // The sender lives as long as this disk.
+            let _ = written.changed().await;
+        }
+        Ok(())
+    }
     fn room(&self) -> Result<(), Error> {
         if self.full.load(Relaxed) {
             self.refused.fetch_add(1, Relaxed);

@@ -7,9 +7,11 @@ use midshift_core::limits;
 use midshift_core::reason::Code;
 use midshift_core::robot::Lane;
 use midshift_core::robot_events::{Gap, InboxItem};
-use midshift_proto::session::{CloseCode, Downlink, Hello};
+use midshift_proto::link::v1;
+use midshift_proto::session::{CloseCode, Downlink, Hello, LaneBatch};
 use midshift_store::{FrameLog, MemoryFrames};
 use midshift_telemetry::{Bugs, SeededBug};
+use prost::Message;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::time::{Instant, advance};
@@ -157,6 +159,8 @@ async fn what_a_session_brings_again_that_the_one_before_handed_over_is_kept_onc
     let reason = Code::Overflow.into();
     let gap = InboxItem::Gap(Gap { lane: Lane::Status, from_seq: 1, to_seq: 3, reason });
     next.status(std::iter::once(gap).chain(samples(4..=5)).collect()).await?;
+    next.beat().await?;
+    next.hears(|down| down.echo).await?;
     disk.stick(false);
     while next.hears(acked).await? < 5 {}
     let kept: Vec<_> = disk.read(0, 1 << 20).await?.iter().map(|f| (f.frame.first_seq, f.frame.last_seq)).collect();
@@ -175,6 +179,50 @@ async fn a_robot_that_is_silent_is_acknowledged_all_the_same() -> Result<()> {
     let begun = Instant::now();
     assert_eq!(robot.hears(acked).await?, 2);
     assert!(begun.elapsed() <= Duration::from_secs(3), "{:?}", begun.elapsed());
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_comes_while_a_write_is_under_way_is_acknowledged_with_it() -> Result<()> {
+    let disk = disk();
+    let world = world_with(otherwise(&disk)).await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    robot.status(samples(1..=1)).await?;
+    robot.beat().await?;
+    robot.hears(|down| down.echo).await?;
+    robot.status(samples(2..=2)).await?;
+    assert_eq!(robot.hears(acked).await?, 2);
+    Ok(())
+}
+
+/// Sends as many samples behind `last` as take this share of the credit, percent; the last of them.
+async fn spend(robot: &Robot, percent: usize, last: u64) -> Result<u64> {
+    let items = samples(1_001..=1_100);
+    let bytes = v1::LaneBatch::from(&LaneBatch { lane: Lane::Status, items }).encoded_len();
+    let all = samples(last + 1..=last + (limits::STATUS_IN_FLIGHT_BYTES * percent / bytes) as u64);
+    for items in all.chunks(limits::SAMPLES_PER_MESSAGE) {
+        robot.status(items.to_vec()).await?;
+    }
+    Ok(last + all.len() as u64)
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_is_taken_and_not_kept_counts_as_spent_also_after_an_acknowledgement() -> Result<()> {
+    let disk = disk();
+    let world = world_with(otherwise(&disk)).await?;
+    let mut robot = Robot::attach(&world, None).await?;
+    let kept = spend(&robot, 40, 0).await?;
+    disk.has(kept).await?;
+    disk.stick(true);
+    let taken = spend(&robot, 8, kept).await?;
+    assert_eq!(robot.hears(acked).await?, kept);
+    spend(&robot, 45, taken).await?;
+    robot.beat().await?;
+    robot.hears(|down| down.echo).await?;
+    let begun = Instant::now();
+    disk.stick(false);
+    while robot.hears(acked).await? <= kept {}
+    assert!(begun.elapsed() < Duration::from_millis(500), "{:?}", begun.elapsed());
     Ok(())
 }
 

@@ -55,7 +55,7 @@ async fn a_ring_with_a_zero_byte_is_refused_as_no_log_would_take_its_samples() -
     let world = world().await?;
     let hello = bytes_of(&FromRobot::Hello(Box::new(Hello { ring: "ri\0ng".to_owned(), ..hello(None)? })));
     let refused = last_word(says(&world, vec![hello]).await?).await.expect_err("no session");
-    assert!(refused.to_string().contains("ring must not contain a zero byte"), "{refused}");
+    assert!(refused.to_string().contains("hello.ring: must not contain a zero byte"), "{refused}");
     Ok(())
 }
 
