@@ -148,10 +148,10 @@ impl StatusWriter {
 async fn write_group(log: &dyn FrameLog, mut group: Vec<Queued>) -> Result<(), Error> {
     leave_out_known(&mut group);
     let kept = write(log, &group).await;
-    if let Err(Error::BadFrame(why)) = &kept
+    if let Err(error @ Error::BadFrame(_)) = &kept
         && group.len() > 1
     {
-        tracing::warn!(why, "status is stored one write at a time");
+        tracing::warn!(%error, "status is stored one write at a time");
         for queued in group {
             let kept = write(log, std::slice::from_ref(&queued)).await;
             queued.answer(kept.is_ok());
