@@ -5,6 +5,7 @@
 //! others for [`LINGER`] once the one before it is done, and not at all for who cannot wait. What the log refuses takes no other write with it.
 
 use crate::status::Write;
+use midshift_core::limits;
 use midshift_store::{Error, FrameLog};
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -14,9 +15,7 @@ use tokio::sync::{Notify, oneshot};
 use tokio::time::{Instant, sleep, sleep_until};
 
 /// How long a write waits for others: an acknowledgement of STATUS may take two seconds.
-pub const LINGER: Duration = Duration::from_millis(500);
-/// So many bytes are written at once, and do not wait for more.
-const GROUP_BYTES: usize = 1024 * 1024;
+const LINGER: Duration = Duration::from_millis(500);
 /// With so many, what sessions that are over have left is let go: their robots bring it again.
 const WAITING_BYTES_MAX: usize = 64 * 1024 * 1024;
 /// After a failed write, robots are asked again not sooner than this.
@@ -52,7 +51,7 @@ struct Waiting {
 
 impl Waiting {
     fn is_due(&self) -> bool {
-        self.is_hurried || self.bytes >= GROUP_BYTES
+        self.is_hurried || self.bytes >= limits::GROUP_COMMIT_BYTES
     }
     /// Lets go what sessions that are over have left, once there is much.
     fn limit(&mut self) {
@@ -69,7 +68,7 @@ impl Waiting {
         let fits = |queued: &&Queued| {
             let is_first = bytes == 0;
             bytes += queued.write.bytes();
-            is_first || bytes <= GROUP_BYTES
+            is_first || bytes <= limits::GROUP_COMMIT_BYTES
         };
         let many = self.queued.iter().take_while(fits).count();
         let group: Vec<Queued> = self.queued.drain(..many).collect();

@@ -60,13 +60,6 @@ async fn stored(disk: &Disk) -> Result<Vec<u64>> {
     Ok(all)
 }
 
-/// Waits until the server has taken what was sent on the session before.
-async fn taken(robot: &mut Robot) -> Result<()> {
-    robot.beat().await?;
-    robot.hears(|down| down.echo).await?;
-    Ok(())
-}
-
 #[tokio::test(start_paused = true)]
 async fn what_comes_beside_the_session_and_on_it_is_one_lane_stored_in_order_and_once() -> Result<()> {
     let (disk, world) = on_disk().await?;
@@ -136,7 +129,7 @@ async fn a_session_that_ends_takes_its_replay_with_it_and_the_next_one_is_told_t
     let mut robot = Robot::attach(&world, None).await?;
     let proof = robot.proof();
     let waiting = ask(&world, replay(&proof, samples(1..=3))?);
-    taken(&mut robot).await?;
+    robot.is_taken().await?;
     assert!(!waiting.is_finished(), "nothing is answered before it is durable");
     let next = Robot::attach(&world, Some(proof)).await?;
     assert_eq!(waiting.await?.expect_err("its session is over").code(), Code::FailedPrecondition);
@@ -155,8 +148,8 @@ async fn while_a_replay_waits_for_the_disk_the_session_goes_on_and_only_one_more
     let mut waiting = Vec::new();
     for last in [100, 200, 300] {
         waiting.push(ask(&world, replay(&proof, samples(last - 99..=last))?));
-        taken(&mut robot).await?;
-        taken(&mut robot).await?;
+        robot.is_taken().await?;
+        robot.is_taken().await?;
     }
     let refused = waiting.pop().ok_or("was asked")?.await?.expect_err("too many");
     assert_eq!(refused.code(), Code::ResourceExhausted);

@@ -153,14 +153,12 @@ async fn what_a_session_brings_again_that_the_one_before_handed_over_is_kept_onc
     disk.stick(true);
     let mut robot = Robot::attach(&world, None).await?;
     robot.status(samples(1..=2)).await?;
-    robot.beat().await?;
-    robot.hears(|down| down.echo).await?;
+    robot.is_taken().await?;
     let mut next = Robot::attach(&world, Some(robot.proof())).await?;
     let reason = Code::Overflow.into();
     let gap = InboxItem::Gap(Gap { lane: Lane::Status, from_seq: 1, to_seq: 3, reason });
     next.status(std::iter::once(gap).chain(samples(4..=5)).collect()).await?;
-    next.beat().await?;
-    next.hears(|down| down.echo).await?;
+    next.is_taken().await?;
     disk.stick(false);
     while next.hears(acked).await? < 5 {}
     let kept: Vec<_> = disk.read(0, 1 << 20).await?.iter().map(|f| (f.frame.first_seq, f.frame.last_seq)).collect();
@@ -188,8 +186,7 @@ async fn what_comes_while_a_write_is_under_way_is_acknowledged_with_it() -> Resu
     let world = world_with(otherwise(&disk)).await?;
     let mut robot = Robot::attach(&world, None).await?;
     robot.status(samples(1..=1)).await?;
-    robot.beat().await?;
-    robot.hears(|down| down.echo).await?;
+    robot.is_taken().await?;
     robot.status(samples(2..=2)).await?;
     assert_eq!(robot.hears(acked).await?, 2);
     Ok(())
@@ -217,8 +214,7 @@ async fn what_is_taken_and_not_kept_counts_as_spent_also_after_an_acknowledgemen
     let taken = spend(&robot, 8, kept).await?;
     assert_eq!(robot.hears(acked).await?, kept);
     spend(&robot, 45, taken).await?;
-    robot.beat().await?;
-    robot.hears(|down| down.echo).await?;
+    robot.is_taken().await?;
     let begun = Instant::now();
     disk.stick(false);
     while robot.hears(acked).await? <= kept {}
@@ -248,8 +244,7 @@ async fn what_a_robot_said_right_before_its_connection_was_lost_is_kept() -> Res
     let world = world_with(otherwise(&disk)).await?;
     let mut robot = Robot::attach(&world, None).await?;
     robot.status(samples(1..=2)).await?;
-    robot.beat().await?;
-    robot.hears(|down| down.echo).await?;
+    robot.is_taken().await?;
     drop(robot);
     disk.written().await;
     let kept: Vec<_> = disk.read(0, 1 << 20).await?.iter().map(|f| (f.frame.first_seq, f.frame.last_seq)).collect();

@@ -243,6 +243,12 @@ impl Robot {
     pub async fn status(&self, items: Vec<InboxItem>) -> Result<()> {
         self.say(Uplink { heartbeat: None, batches: vec![LaneBatch { lane: Lane::Status, items }] }).await
     }
+    /// Waits until the server has taken what was sent on this session before.
+    pub async fn is_taken(&mut self) -> Result<()> {
+        self.beat().await?;
+        self.hears(|down| down.echo).await?;
+        Ok(())
+    }
     /// The next downlink that says something of what is looked for.
     pub async fn hears<T>(&mut self, look: impl Fn(&Downlink) -> Option<T>) -> Result<T> {
         while let Some(message) = self.down.message().await? {
