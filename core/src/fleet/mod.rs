@@ -123,6 +123,7 @@ pub fn cycle(view: &mut FleetProjection, now: Now, board: &Board, pace: Pace, pl
     view.screened.take();
     incidents::open_put_aside(view, now, plan);
     refusals::try_again(view);
+    // At once where somebody plainly lacks them; rows of who is gone may hide a new robot until the sweep.
     if pace == Pace::Sweep || view.authority.len() < view.sessions.len() {
         welcome(view, now, board, plan);
     }

@@ -46,7 +46,9 @@ pub(crate) struct RowCompressor(Compressor<'static>);
 
 impl RowCompressor {
     pub(crate) fn new() -> io::Result<Self> {
-        Compressor::new(LEVEL).map(Self)
+        let mut compressor = Compressor::new(LEVEL)?;
+        compressor.include_checksum(true)?;
+        Ok(Self(compressor))
     }
     /// The row of packed frames.
     pub(crate) fn row(&mut self, packed: Vec<u8>) -> io::Result<Vec<u8>> {
@@ -142,6 +144,12 @@ mod tests {
         assert_eq!(unpack(&row), Ok(frames.clone()));
         for cut in 1..row.len() {
             assert!(unpack(&row[..cut]).is_err(), "cut at {cut}");
+        }
+        for at in 0..row.len() {
+            let mut garbled = row.clone();
+            garbled[at] ^= 0x10;
+            // Bits that say nothing may change.
+            assert!(unpack(&garbled).map_or(true, |read| read == frames), "garbled at {at}");
         }
         let mut longer = row;
         longer[1] += 1;

@@ -33,11 +33,6 @@ fn list_own_reasons(report: &ReportedState) -> Vec<Reason> {
     [stop, manual, fault].into_iter().flatten().collect()
 }
 
-/// Whether it says any of that.
-fn is_out_of_work(report: &ReportedState) -> bool {
-    report.hardware_stop != HardwareStop::None || report.mode != Mode::Automatic || report.fault.is_some()
-}
-
 /// The breaker of a robot, if it is open.
 fn breaker(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> {
     let control = view.control.get(robot_id.as_str()).map(|c| &c.row).filter(|c| c.breaker.is_some())?;
@@ -61,7 +56,8 @@ pub(in crate::fleet) fn tell_lasting(view: &mut FleetProjection, board: &Board, 
         .filter_map(|i| Some((i.robot_id.clone()?, i.reason.code)))
         .collect();
     let broken_off = view.control.values().map(|c| &c.row).filter(|c| c.breaker.is_some()).map(|c| &c.robot_id);
-    let out_of_work = board.iter().filter(|(_, live)| is_out_of_work(&live.report)).map(|(robot_id, _)| robot_id);
+    let says_any = |live: &NewestHeartbeat| !list_own_reasons(&live.report).is_empty();
+    let out_of_work = board.iter().filter(|(_, live)| says_any(live)).map(|(robot_id, _)| robot_id);
     let robots: BTreeSet<RobotId> =
         out_of_work.chain(broken_off).chain(open.iter().map(|(robot_id, _)| robot_id)).cloned().collect();
     for robot_id in &robots {
