@@ -2,6 +2,7 @@
 //!
 //! Invariant: a child lives no longer than its parent: it ends when its stdin does. Called by every measurement.
 
+use crate::usage::Memory;
 use anyhow::{Context, bail, ensure};
 use std::io::{BufRead, BufReader, Write};
 use std::net::SocketAddr;
@@ -99,12 +100,24 @@ impl Child {
         store: Option<&str>,
         core: Option<usize>,
     ) -> anyhow::Result<Self> {
+        Self::serve_at(None, data, site, store, core).await
+    }
+    /// As [`Child::serve`], at an address that it had before.
+    pub async fn serve_at(
+        listen: Option<SocketAddr>,
+        data: &Path,
+        site: Option<&Path>,
+        store: Option<&str>,
+        core: Option<usize>,
+    ) -> anyhow::Result<Self> {
+        let listen = listen.map(|listen| listen.to_string());
         let data = data.to_str().context("a path that is no text")?;
         let mut role = vec!["serve", "--data", data];
         if let Some(site) = site {
             role.extend(["--site", site.to_str().context("a path that is no text")?]);
         }
         role.extend(store.iter().flat_map(|url| ["--store", url]));
+        role.extend(listen.iter().flat_map(|listen| ["--listen", listen]));
         Self::start(&role, core)?.listening().await
     }
     /// Waits until it takes connections.
@@ -158,9 +171,7 @@ impl Child {
 
     /// Memory in RAM, KiB.
     pub fn rss_kib(&self) -> anyhow::Result<f64> {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.process.id()))?;
-        let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:")).context("no VmRSS")?;
-        Ok(line.trim().trim_end_matches(" kB").trim().parse()?)
+        Ok(Memory::read(self.pid())?.all_mib * 1_024.0)
     }
 }
 

@@ -8,8 +8,9 @@
 use crate::child::{Child, MESSAGES, SESSIONS, raise_files_max};
 use crate::engine::{Bed, Engine, EngineArgs};
 use crate::figure::{Figure, percentile};
+use crate::simulators::{await_sessions, start_robots};
 use crate::{grid_map, saturation};
-use anyhow::{Context, ensure};
+use anyhow::ensure;
 use std::path::Path;
 use std::time::Duration;
 use tokio::time::{Instant, sleep};
@@ -18,12 +19,6 @@ use tokio::time::{Instant, sleep};
 const ROBOTS: usize = 10_000;
 /// Descriptors of a process that are no robot's connection: databases, pipes, the runtime.
 const OTHER_FILES: u64 = 200;
-/// Processes that the robots are split over.
-const SIMULATORS: usize = 2;
-/// All robots are attached by then.
-const ATTACH_WITHIN: Duration = Duration::from_secs(300);
-/// How often that is looked at.
-const LOOK_EVERY: Duration = Duration::from_millis(200);
 /// Bytes of one report on the wire.
 const REPORT_BYTES: usize = 170;
 /// Rows of PostgreSQL's limit, and how many of them share a commit.
@@ -219,20 +214,8 @@ async fn steady(args: &LinkArgs, robots: usize, of: Of<'_>) -> anyhow::Result<Le
     let map = grid_map::write(bed.path(), (robots as f64).sqrt() as usize + 2)?;
     let mut server = server(of, &bed, &map).await?;
     let bare_kib = server.rss_kib()?;
-    let (address, map) = (server.address.to_string(), map.to_str().context("a path that is no text")?);
-    let number = |n: usize| n.to_string();
-    let mut simulators = Vec::new();
-    for part in 0..SIMULATORS {
-        let (from, to) = (robots * part / SIMULATORS, robots * (part + 1) / SIMULATORS);
-        let (robots, from, to) = (number(robots), number(from), number(to));
-        let role = ["robots", "--server", &address, "--site", map, "--robots", &robots, "--from", &from, "--to", &to];
-        simulators.push(Child::start(&role, Some(1 + part))?);
-    }
-    let end = Instant::now() + ATTACH_WITHIN;
-    while (server.ask(SESSIONS)? as usize) < robots {
-        ensure!(Instant::now() < end, "{} of {robots} robots are attached", server.ask(SESSIONS)?);
-        sleep(LOOK_EVERY).await;
-    }
+    let _robots = start_robots(&server, &map, robots)?;
+    await_sessions(&mut server, robots).await?;
     let mut leg = measure(args, of, &mut server, args.seconds, |server| server.ask(MESSAGES)).await?;
     leg.robot_kib = (server.rss_kib()? - bare_kib) / robots as f64;
     ensure!(server.ask(SESSIONS)? as usize >= robots, "robots were lost");

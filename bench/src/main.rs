@@ -11,15 +11,24 @@ mod grid_map;
 mod link;
 mod listen;
 mod offer;
+#[expect(clippy::expect_used, reason = "shared with the tests, which fail by panicking")]
+#[expect(dead_code, reason = "shared with the tests, which commit old sites whole too")]
+#[path = "../../tests/src/old_site.rs"]
+mod old_site;
 mod old_store;
+#[path = "../../tests/src/old_tables.rs"]
+mod old_tables;
 mod ota;
 mod outcome;
 mod plan;
 mod questions;
+mod reads;
 mod robot;
 mod roles;
 mod saturation;
 mod session_baseline;
+mod simulators;
+mod start;
 mod stop;
 mod submit;
 mod swarm;
@@ -46,6 +55,10 @@ enum Name {
     Offer(offer::OfferArgs),
     /// Many robots on the link once a second, and few at the knee.
     Link(link::LinkArgs),
+    /// From the start of a server to its first durable answer, what it takes idle, and until its robots are back after a kill.
+    Start(start::StartArgs),
+    /// What calls cost that only read, at a site where thousands of tasks are over.
+    Reads(reads::ReadsArgs),
     /// How often the gates of a roll-out are right and wrong, simulated from a seed.
     Gates(gates::GatesArgs),
     /// Software of robots: directives, ten thousand robots assigned, the way back; a download at line rate, patches, downloads that are cut off.
@@ -83,6 +96,8 @@ fn main() -> anyhow::Result<()> {
         Name::Task(args) => wait(task::run(args, &note))?,
         Name::Offer(args) => wait(offer::run(args, &note))?,
         Name::Link(args) => wait(link::run(args, &note))?,
+        Name::Start(args) => wait(start::run(args, &note))?,
+        Name::Reads(args) => wait(reads::run(args, &note))?,
         Name::Gates(args) => gates::run(args)?,
         Name::Ota(args) => {
             let outcome = wait(async { Ok(ota::run(args, &note).await) })?;

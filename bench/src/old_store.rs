@@ -7,6 +7,8 @@ use crate::child::Child;
 use crate::engine::{Bed, Engine, EngineArgs};
 use crate::figure::{Figure, percentile};
 use crate::grid_map;
+use crate::old_site::OldSite;
+use crate::old_tables;
 use crate::offer::{Idle, one};
 use crate::submit::transports;
 use anyhow::{Context, ensure};
@@ -23,14 +25,6 @@ use std::path::{Path, PathBuf};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tonic::transport::Channel;
-
-#[expect(clippy::expect_used, reason = "shared with the tests, which fail by panicking")]
-#[expect(dead_code, reason = "shared with the tests, which commit old sites whole too")]
-#[path = "../../tests/src/old_site.rs"]
-mod old_site;
-#[path = "../../tests/src/old_tables.rs"]
-mod old_tables;
-use old_site::OldSite;
 
 /// Side of the free grid that robots stand on.
 const SIDE: usize = 40;

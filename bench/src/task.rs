@@ -4,9 +4,10 @@
 //! The robots do in no time what they are given. The server and they have a core each; whoever submits, and PostgreSQL, run on all. Its CPU is
 //! told for itself.
 
-use crate::child::{Child, SESSIONS};
+use crate::child::Child;
 use crate::engine::{Engine, EngineArgs};
 use crate::figure::Figure;
+use crate::simulators::await_sessions;
 use crate::submit::transports;
 use crate::usage::{Rates, Usage};
 use anyhow::ensure;
@@ -14,11 +15,9 @@ use midshift_core::site::{DEMO, text};
 use midshift_proto::task::v1::SubmitTaskRequest;
 use midshift_proto::task::v1::task_service_client::TaskServiceClient;
 use std::time::Duration;
-use tokio::time::{Instant, MissedTickBehavior, interval, sleep};
+use tokio::time::{Instant, MissedTickBehavior, interval};
 use tonic::transport::Channel;
 
-/// All robots are attached by then.
-const ATTACH_WITHIN: Duration = Duration::from_secs(60);
 /// How often a server is asked how many tasks it has, with work and without.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
 /// Different transports that are submitted over and over.
@@ -81,11 +80,7 @@ async fn measure(args: &TaskArgs, engine: &Engine, requests: &[SubmitTaskRequest
     let bed = engine.bed(args.engine.dir.as_ref())?;
     let mut server = bed.serve(None, Some(0)).await?;
     let robots = start_robots(args, &server)?;
-    let end = Instant::now() + ATTACH_WITHIN;
-    while (server.ask(SESSIONS)? as usize) < args.robots {
-        ensure!(Instant::now() < end, "{} of {} robots are attached", server.ask(SESSIONS)?, args.robots);
-        sleep(LOOK_EVERY).await;
-    }
+    await_sessions(&mut server, args.robots).await?;
     let (idle, _, database_idle) = spend(args, engine, &mut server, None).await?;
     let work = Submitter { client: TaskServiceClient::new(server.channel().await?), requests, submitted: 0 };
     let (busy, tasks, database_busy) = spend(args, engine, &mut server, Some(work)).await?;

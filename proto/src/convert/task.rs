@@ -427,16 +427,28 @@ pub struct TaskFilter {
 impl TaskFilter {
     /// Whether a task is meant.
     pub fn admits(&self, intake: &TaskIntake, state: &TaskState) -> bool {
-        let spec = &intake.spec;
         (self.phases.is_empty() || self.phases.contains(&state.phase))
             && (self.robot_ids.is_empty() || state.robot_id.as_ref().is_some_and(|r| self.robot_ids.contains(r)))
-            && (self.kinds.is_empty() || self.kinds.contains(&spec.kind))
+            && self.admits_intake(intake)
+    }
+
+    /// Whether what was asked for is meant, wherever its task is.
+    pub fn admits_intake(&self, intake: &TaskIntake) -> bool {
+        let spec = &intake.spec;
+        (self.kinds.is_empty() || self.kinds.contains(&spec.kind))
             && self.labels.iter().all(|(k, v)| spec.labels.get(k) == Some(v))
             && (self.external_ref.is_empty() || self.external_ref == spec.external_ref)
             && self.created_after.is_none_or(|t| intake.created >= t)
             && self.created_before.is_none_or(|t| intake.created < t)
             && (self.task_ids.is_empty() || self.task_ids.contains(&intake.task_id))
             && intake.task_id.as_str().starts_with(&self.task_id_prefix)
+    }
+
+    /// Whether it asks for anything of an intake but its id.
+    pub fn asks_intake(&self) -> bool {
+        !(self.kinds.is_empty() && self.labels.is_empty() && self.external_ref.is_empty())
+            || self.created_after.is_some()
+            || self.created_before.is_some()
     }
 }
 

@@ -2,7 +2,7 @@
 
 use crate::TaskService;
 use crate::rows::{TaskRows, read_many, sees, unavailable};
-use crate::search::{self, Direction, Search};
+use crate::search::{Direction, Search};
 use midshift_core::identity::Caller;
 use midshift_core::ids::TaskId;
 use midshift_core::limits;
@@ -15,9 +15,6 @@ use prost::Message;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::sync::Arc;
-
-/// Fewest rows that one read of the store asks for, whatever the page.
-const READ_MIN: usize = 100;
 
 fn print_of(filter: &Option<v1::TaskFilter>) -> String {
     let bytes = filter.as_ref().map(Message::encode_to_vec).unwrap_or_default();
@@ -91,11 +88,13 @@ impl TaskService {
     ) -> Result<v1::ListTasksResponse, Refusal> {
         let (store, site) = (self.store(), &self.inner.parts.site);
         let admits = |t: &TaskRows| filter.admits(&t.intake, &t.state) && sees(site, by, &t.intake);
-        let mut search = Search::new(filter, Direction::NewestFirst, after.clone(), (size + 1).max(READ_MIN));
+        let mut search = Search::new(filter, Direction::NewestFirst, after.clone(), size + 1);
         let (mut tasks, mut rows_read) = (Vec::new(), 0);
         let go_on = |after: Option<&Cursor>| after.map(|c| token(print, c)).unwrap_or_default();
         while rows_read < limits::LIST_ROWS_READ_MAX {
             let rows = search.next(store).await.map_err(unavailable)?;
+            // The first read is enough for most pages.
+            search.grow();
             if rows.is_empty() {
                 return Ok(v1::ListTasksResponse {
                     tasks,
@@ -103,7 +102,7 @@ impl TaskService {
                     rows_read: rows_read as u64,
                 });
             }
-            let found = read_many(store, &search::admitted(filter, &rows)).await?;
+            let found = read_many(store, &search.find_candidates(store, &rows).await.map_err(unavailable)?).await?;
             let mut found: BTreeMap<_, _> = found.into_iter().map(|t| (t.intake.task_id.to_string(), t)).collect();
             for row in &rows {
                 rows_read += 1;

@@ -6,7 +6,7 @@
 use crate::TaskService;
 use crate::grpc::CallId;
 use crate::rows::{read_many, robot_kept, sees, unavailable};
-use crate::search::{self, Direction, Search};
+use crate::search::{Direction, Search};
 use crate::watch_state::{Image, WatchState};
 use midshift_core::fleet::requests::allowed_resolutions;
 use midshift_core::identity::Caller;
@@ -156,7 +156,8 @@ impl Watcher {
             if rows.is_empty() {
                 break;
             }
-            for task in read_many(store.as_ref(), &search::admitted(&begin, &rows)).await? {
+            let found = search.find_candidates(store.as_ref(), &rows).await.map_err(unavailable)?;
+            for task in read_many(store.as_ref(), &found).await? {
                 let is_seen = sees(&self.service.inner.parts.site, &self.by, &task.intake);
                 if is_seen && begin.admits(&task.intake, &task.state) {
                     self.shown.insert(task.state.task_id.clone(), task.revision);

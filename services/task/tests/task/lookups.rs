@@ -178,3 +178,53 @@ async fn a_watch_without_a_filter_begins_with_what_is_alive_and_reads_nothing_el
     let named = TaskFilter { task_ids: vec!["OLD-000002".into()], ..TaskFilter::default() };
     assert_eq!(first(Some(named)).await.0, ["OLD-000002"], "what is over is told where it is named");
 }
+
+#[tokio::test]
+async fn a_page_of_one_reads_little_more_than_it_shows() {
+    let old = Old::site().await;
+    let (page, rows) = old.page(TaskFilter::default(), 1, "").await;
+    assert_eq!((page.tasks.len(), page.rows_read), (1, 2));
+    assert!(rows <= 8, "{rows} rows");
+}
+
+#[tokio::test]
+async fn a_search_by_what_was_asked_for_reads_each_intake_once_and_of_other_tasks_nothing_else() {
+    let old = Old::site().await;
+    let rare = TaskFilter { external_ref: "never".to_owned(), ..TaskFilter::default() };
+    let (page, rows) = old.page(rare, 1, "").await;
+    assert_eq!(page.rows_read as usize, rows);
+}
+
+#[tokio::test]
+async fn what_was_asked_for_is_found_whatever_stands_in_it() {
+    let world = World::new().await;
+    let odd = "a \"quoted\" \\ back\u{e9}\u{1f916}\tslash";
+    for (request_id, text) in [("odd", odd), ("plain", "plain")] {
+        let mut request = patrol(request_id, &[]);
+        let Some(v1::submit_task_request::Body::Spec(spec)) = &mut request.body else { panic!("a patrol is a spec") };
+        spec.external_ref = text.into();
+        spec.labels.insert("line".into(), text.into());
+        submit(&world.service, request).await.expect("admitted");
+    }
+    let found = async |filter: TaskFilter| {
+        let request = ListTasksRequest { filter: Some(filter), ..ListTasksRequest::default() };
+        let page = world.service.list_tasks(local(request)).await.expect("a page").into_inner();
+        page.tasks.into_iter().map(|task| task.spec.expect("always set").external_ref).collect::<Vec<_>>()
+    };
+    let by_label = |text: &str| TaskFilter { labels: [("line".into(), text.into())].into(), ..TaskFilter::default() };
+    let by_reference = |text: &str| TaskFilter { external_ref: text.into(), ..TaskFilter::default() };
+    let queued = |filter| TaskFilter { states: vec![v1::TaskState::Queued.into()], ..filter };
+    for text in [odd, "plain"] {
+        for filter in [by_label(text), by_reference(text), queued(by_label(text)), queued(by_reference(text))] {
+            assert_eq!(found(filter).await, [text]);
+        }
+        assert_eq!(found(TaskFilter { types: vec!["patrol".into()], ..by_label(text) }).await, [text]);
+        assert_eq!(found(TaskFilter { types: vec!["other".into()], ..by_label(text) }).await, [""; 0]);
+        let types = vec!["other".into(), "patrol".into()];
+        assert_eq!(found(TaskFilter { types, ..TaskFilter::default() }).await.len(), 2);
+        // The value of another label, and a part of a text.
+        let other = TaskFilter { labels: [("row".into(), text.into())].into(), ..TaskFilter::default() };
+        assert_eq!(found(other).await, [""; 0]);
+        assert_eq!(found(by_reference(&text[..3])).await, [""; 0]);
+    }
+}
