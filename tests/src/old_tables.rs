@@ -12,6 +12,7 @@ use midshift_core::ids::SiteId;
 use midshift_core::item::{Item, RowChange, Write as Change};
 use midshift_core::rows::{Index, Table, Writer};
 use midshift_process::clock::clock;
+use midshift_server::keep_limits::KeepLimits;
 use midshift_server::storage::{Database, Storage};
 use sqlx::postgres::PgConnectOptions;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqliteSynchronous};
@@ -69,7 +70,7 @@ pub async fn make(site: &OldSite, database: &Database, data: &Path, site_id: &Si
 }
 
 async fn open(database: &Database, data: &Path, site_id: &SiteId) -> anyhow::Result<Storage> {
-    database.open(data, site_id.clone(), clock(1000)).await
+    database.open(data, site_id.clone(), clock(1000), KeepLimits::default().status_log_bytes).await
 }
 
 /// The tables of an engine, in a transaction.

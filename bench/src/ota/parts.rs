@@ -170,6 +170,7 @@ pub fn insecure_server(data: PathBuf, listen: SocketAddr, ota_keys: Option<PathB
         spare_token: false,
         force_map: false,
         share: Default::default(),
+        keep: Default::default(),
         trust: None,
         database: Default::default(),
         beacon_listen: None,

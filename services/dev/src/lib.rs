@@ -132,6 +132,7 @@ async fn play(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Resul
         naive: NaiveRules::default(),
         stops: Some(stops.folder.clone()),
         stop_port: Some(stops.service.address().port()),
+        keep: Default::default(),
         jumped_before: None,
         identity: None,
         port: door::alone("business"),

@@ -20,22 +20,18 @@ use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
 
 /// How much one peer may take of a port.
-#[derive(Clone, Copy, Debug, clap::Args)]
+#[derive(Clone, Copy, Debug, Default, clap::Args)]
 pub struct Share {
     /// Connections from one address, or one /64 of IPv6, at a time. A proxy in front is one address. Without it a quarter of what the port takes: 4096, or fewer
-    /// if the process may not have as many files open.
+    /// if the process may not have as many files open; with --insecure all.
     #[arg(long, value_name = "N")]
     pub connections_per_address: Option<usize>,
-    /// Requests that one robot, token or address may begin a second, for long; twice as many at once.
-    #[arg(long, default_value = "1000")]
-    pub requests_per_second: NonZeroU32,
-}
-
-impl Default for Share {
-    fn default() -> Self {
-        const PER_SECOND: NonZeroU32 = NonZeroU32::new(limits::REQUESTS_PER_SECOND).unwrap();
-        Self { connections_per_address: None, requests_per_second: PER_SECOND }
-    }
+    /// Requests that one robot, token or address may begin a second, for long; twice as many at once. Without it 1000; with --insecure as many as there are.
+    #[arg(long, value_name = "N")]
+    pub requests_per_second: Option<NonZeroU32>,
+    /// Watches that one robot, token or address may have at once: calls that go on to tell what is new. Without it 256; with --insecure the 4096 of the port.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=limits::WATCHES_MAX as i64))]
+    pub watches_per_caller: Option<u32>,
 }
 
 impl Share {
@@ -46,19 +42,34 @@ impl Share {
     pub fn config(self, port: &'static str) -> anyhow::Result<Config> {
         const PART: usize = limits::CONNECTIONS_MAX / limits::CONNECTIONS_PER_NETWORK_MAX;
         let connections_max = connections_max()?;
-        let each = self.connections_per_address.map_or(connections_max / PART, |asked| asked.min(connections_max));
-        let burst = self
-            .requests_per_second
-            .saturating_mul(const { NonZeroU32::new(limits::REQUESTS_BURST / limits::REQUESTS_PER_SECOND).unwrap() });
-        let rate = Rate { per_second: self.requests_per_second, burst };
-        Ok(Config { port, connections_max, connections_per_network_max: each, rate, ..Config::default() })
+        let usual = Config { port, connections_max, ..Config::default() };
+        Ok(self.over(Config { connections_per_network_max: connections_max / PART, ..usual }))
+    }
+
+    /// The limits of a port without login: those that were asked for, beside the port's own.
+    pub fn config_without_login(self, port: &'static str) -> Config {
+        self.over(alone(port))
+    }
+
+    fn over(self, usual: Config) -> Config {
+        const BURST: NonZeroU32 = NonZeroU32::new(limits::REQUESTS_BURST / limits::REQUESTS_PER_SECOND).unwrap();
+        let rate = |per_second: NonZeroU32| Rate { per_second, burst: per_second.saturating_mul(BURST) };
+        let connections = self.connections_per_address.map(|asked| asked.min(usual.connections_max));
+        Config {
+            connections_per_network_max: connections.unwrap_or(usual.connections_per_network_max),
+            rate: self.requests_per_second.map_or(usual.rate, rate),
+            watches_per_principal_max: self.watches_per_caller.map_or(usual.watches_per_principal_max, |n| n as usize),
+            ..usual
+        }
     }
 
     /// The same as arguments of a program of ours.
     pub fn arguments(self) -> Vec<String> {
-        let Self { connections_per_address, requests_per_second } = self;
+        let Self { connections_per_address, requests_per_second, watches_per_caller } = self;
         let connections = connections_per_address.map(|n| format!("--connections-per-address={n}"));
-        connections.into_iter().chain([format!("--requests-per-second={requests_per_second}")]).collect()
+        let requests = requests_per_second.map(|n| format!("--requests-per-second={n}"));
+        let watches = watches_per_caller.map(|n| format!("--watches-per-caller={n}"));
+        connections.into_iter().chain(requests).chain(watches).collect()
     }
 }
 
@@ -167,4 +178,31 @@ fn tls(proof: &ServerProof, clock: &Arc<dyn Clock>) -> anyhow::Result<Arc<Server
     let key = PrivateKeyDer::from_pem_slice(proof.key_pem.as_bytes()).context("reading the server's key")?;
     let roots = certificates(&proof.authority_pem).context("reading the site's root")?;
     server_config(chain, key, Clients::Asked(roots), clock).context("what the server proves itself with")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_one_peer_may_take_holds_with_a_login_and_without_and_nothing_else_does_unless_it_was_asked_for() {
+        let asked = Share {
+            connections_per_address: Some(7),
+            requests_per_second: NonZeroU32::new(5),
+            watches_per_caller: Some(3),
+        };
+        for config in [asked.config("business").expect("a port"), asked.config_without_login("business")] {
+            let taken = (config.connections_per_network_max, config.rate.per_second.get(), config.rate.burst.get());
+            assert_eq!((taken, config.watches_per_principal_max), ((7, 5, 10), 3));
+        }
+        let (usual, free) = (Share::default().config("business").expect("a port"), alone("business"));
+        assert_eq!(usual.rate.per_second.get(), limits::REQUESTS_PER_SECOND);
+        assert_eq!(usual.watches_per_principal_max, limits::WATCHES_PER_PRINCIPAL_MAX);
+        let without = Share::default().config_without_login("business");
+        let taken = |config: &Config| {
+            let Config { connections_per_network_max, rate, watches_per_principal_max, .. } = *config;
+            (connections_per_network_max, rate.per_second, watches_per_principal_max)
+        };
+        assert_eq!(taken(&without), taken(&free));
+    }
 }

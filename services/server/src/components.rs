@@ -1,5 +1,6 @@
 //! What a server is built from.
 
+use crate::keep_limits::KeepLimits;
 use midshift_cli::roles::Roles;
 use midshift_core::fleet::maps::MapChange;
 use midshift_core::site::Site;
@@ -49,6 +50,8 @@ pub struct Components {
     pub site_text: String,
     /// What became of the map that this process was started with.
     pub map: MapChange,
+    /// How much of samples and logs is kept.
+    pub keep: KeepLimits,
     /// Where the time of the wall, the link and the site is read.
     pub clock: Arc<dyn Clock>,
     /// What the wall jumped at last before this run, milliseconds ahead, and UTC when it had.

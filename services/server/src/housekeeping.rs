@@ -26,8 +26,6 @@ use std::time::Duration;
 const PRUNE_EVERY: Duration = Duration::from_secs(60);
 /// How often samples of histograms are folded: without a scrape they would gather for ever.
 const FOLD_EVERY: Duration = Duration::from_secs(5);
-/// Log entries kept at most, beside the days of [`Retention::Week`].
-const ENTRIES_MAX: u64 = 20_000_000;
 
 /// Until it is dropped.
 pub async fn run(parts: &Components, task: Option<TaskService>) {
@@ -50,7 +48,7 @@ async fn prune(parts: &Components, task: Option<TaskService>) {
     let (store, frames, clock) = (parts.store.as_ref(), parts.frames.as_ref(), parts.clock.as_ref());
     loop {
         tokio::time::sleep(PRUNE_EVERY).await;
-        let turn = Turn { store, frames, clock, task: task.as_ref() };
+        let turn = Turn { store, frames, clock, task: task.as_ref(), log_entries_max: parts.keep.log_entries };
         turn.prune_all(|role| parts.roles.has(role)).await;
         if let Err(error) = oldest::publish_ages(store, frames, clock).await {
             tracing::warn!(%error, "how old the oldest rows are cannot be read");
@@ -68,6 +66,8 @@ pub struct Turn<'t> {
     pub clock: &'t dyn Clock,
     /// Intake of tasks, in a process that has it.
     pub task: Option<&'t TaskService>,
+    /// Entries of each log that are kept at most.
+    pub log_entries_max: u64,
 }
 
 impl Turn<'_> {
@@ -83,7 +83,7 @@ impl Turn<'_> {
             if let Err(error) = midshift_fleet::prune(store, clock).await {
                 tracing::warn!(%error, "tasks that ended long ago could not be taken away");
             }
-            if let Err(error) = prune_entries(store, clock).await {
+            if let Err(error) = prune_entries(store, clock, self.log_entries_max).await {
                 tracing::warn!(%error, "old log entries could not be taken away");
             }
         }
@@ -101,8 +101,9 @@ impl Turn<'_> {
             if let Err(error) = midshift_telemetry::prune(store, frames, clock).await {
                 tracing::warn!(%error, "rows of rings and robots that are gone could not be taken away");
             }
-            if let Err(error) = frames.prune().await {
-                tracing::warn!(%error, "old status could not be taken away");
+            match frames.prune().await {
+                Ok(bytes) => metrics::counter!("midshift_telemetry_pruned_bytes_total").increment(bytes),
+                Err(error) => tracing::warn!(%error, "old status could not be taken away"),
             }
             match frames.coarsen(precision::coarsen).await {
                 Ok(rows) => metrics::counter!("midshift_telemetry_coarsened_total").increment(rows),
@@ -132,7 +133,7 @@ async fn keep_audit(parts: &Components) {
     }
 }
 
-async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), Error> {
+async fn prune_entries(store: &dyn Store, clock: &dyn Clock, entries_max: u64) -> Result<(), Error> {
     // Until fleet has consumed something nothing may go.
     let Some((fleet, _)) = midshift_store::load::<FleetMark>(store, "fleet").await? else { return Ok(()) };
     let wall = clock.now().steady_wall();
@@ -141,7 +142,7 @@ async fn prune_entries(store: &dyn Store, clock: &dyn Clock) -> Result<(), Error
         Some((ota, _)) if !is_abandoned(store, ota.seq, wall).await? => fleet.seq.min(ota.seq),
         _ => fleet.seq,
     };
-    let keep = EntriesKept { before_unix_ms: before.0, entries_max: ENTRIES_MAX, floor };
+    let keep = EntriesKept { before_unix_ms: before.0, entries_max, floor };
     store.prune(keep).await.map(drop)
 }
 

@@ -8,6 +8,7 @@ mod clock_jump;
 mod components;
 mod denials;
 mod housekeeping;
+pub mod keep_limits;
 pub mod planning;
 pub mod serve;
 mod server;

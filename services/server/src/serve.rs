@@ -2,6 +2,7 @@
 //! processes on one PostgreSQL database.
 
 use crate::changed_map;
+use crate::keep_limits::KeepLimits;
 use crate::planning::Planning;
 use crate::server::Server;
 use crate::storage::{Database, Storage};
@@ -20,7 +21,7 @@ use midshift_ota::content::Room;
 use midshift_ota::folder::Owner;
 use midshift_ota::rollouts::known_bundles;
 use midshift_ota::{OtaReader, OtaService};
-use midshift_process::door::{self, Share};
+use midshift_process::door::Share;
 use midshift_process::{clock, logs};
 use midshift_store::Store;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -85,6 +86,9 @@ pub struct Serve {
     /// until a start finds nothing in the way.
     #[arg(long)]
     pub force_map: bool,
+    /// How much of samples and logs is kept.
+    #[command(flatten)]
+    pub keep: KeepLimits,
     /// What one peer may take.
     #[command(flatten)]
     pub share: Share,
@@ -193,7 +197,7 @@ async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow
     let clock = clock::clock(1000);
     midshift_process::recorder::handle();
     let site_id = loaded.site.site_id().clone();
-    let storage = args.database.open(&args.data, site_id, clock.clone()).await?;
+    let storage = args.database.open(&args.data, site_id, clock.clone(), args.keep.status_log_bytes).await?;
     clock_doubt::check_start(&args.data, &*clock, &*storage.store()).await?;
     let (loaded, map) = match roles.has(Role::Fleet) {
         true => changed_map::choose(&*storage.store(), loaded, args.force_map, clock.now()).await?,
@@ -219,6 +223,7 @@ async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow
         site: loaded.site,
         site_text: loaded.text,
         map,
+        keep: args.keep,
         jumped_before: clock_jump::before(&args.data, clock.now().wall),
         clock: clock.clone(),
         ota,
@@ -229,7 +234,7 @@ async fn serve(args: Serve, shutdown: CancellationToken, say: Say<'_>) -> anyhow
         stop_port: beside.is_some().then(|| args.stop_listen.port()),
         port: match identity {
             Some(_) => args.share.config("business")?,
-            None => door::alone("business"),
+            None => args.share.config_without_login("business"),
         },
         identity: identity.clone(),
         planning: planning.handle(),

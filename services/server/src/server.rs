@@ -475,6 +475,7 @@ mod tests {
             naive: NaiveRules::default(),
             stops: None,
             stop_port: None,
+            keep: Default::default(),
             jumped_before: None,
             planning: planning.handle(),
         })

@@ -5,8 +5,8 @@ use midshift_core::Boxed;
 use midshift_core::ids::SiteId;
 use midshift_core::time::Clock;
 use midshift_store::{
-    FRAME_BYTES_DEFAULT, FrameLog, HeartbeatLog, Migrated, PostgresConfig, PostgresFrames, PostgresHeartbeats,
-    PostgresStore, Road, SqliteFrames, SqliteStore, Store,
+    FrameLog, HeartbeatLog, Migrated, PostgresConfig, PostgresFrames, PostgresHeartbeats, PostgresStore, Road,
+    SqliteFrames, SqliteStore, Store,
 };
 use std::path::Path;
 use std::sync::Arc;
@@ -48,19 +48,20 @@ impl Database {
         })
     }
 
-    /// Opens what is kept of `site_id`.
+    /// Opens what is kept of `site_id`: of samples at most `status_log_bytes`.
     pub fn open<'a>(
         &'a self,
         data: &'a Path,
         site_id: SiteId,
         clock: Arc<dyn Clock>,
+        status_log_bytes: u64,
     ) -> Boxed<'a, anyhow::Result<Storage>> {
         Box::pin(async move {
             match self.postgres()? {
                 Some(config) => {
                     let store = PostgresStore::open(&config, site_id.clone(), clock.clone()).await;
                     let store = store.context("opening the store in PostgreSQL")?;
-                    let frames = PostgresFrames::open(&config, site_id.clone(), clock, FRAME_BYTES_DEFAULT).await;
+                    let frames = PostgresFrames::open(&config, site_id.clone(), clock, status_log_bytes).await;
                     let frames = frames.context("opening the samples in PostgreSQL")?;
                     let heard = PostgresHeartbeats::open(&config, site_id)
                         .await
@@ -69,7 +70,7 @@ impl Database {
                 }
                 None => {
                     let store = SqliteStore::open(data, site_id.clone(), clock.clone()).await?;
-                    let frames = SqliteFrames::open(data, site_id, clock, FRAME_BYTES_DEFAULT).await?;
+                    let frames = SqliteFrames::open(data, site_id, clock, status_log_bytes).await?;
                     Ok(Storage::Sqlite(Arc::new(store), Arc::new(frames)))
                 }
             }
@@ -153,6 +154,28 @@ impl Storage {
 #[cfg(test)]
 mod tests {
     use super::Database;
+    use midshift_core::ids::{RobotId, SiteId};
+    use midshift_process::clock::clock;
+    use midshift_store::Frame;
+
+    #[tokio::test]
+    async fn samples_over_the_bytes_that_are_kept_go_at_the_next_turn() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let site = SiteId::parse("north").expect("an id");
+        let frame = |seq| Frame {
+            robot_id: RobotId::parse("r1").expect("an id"),
+            ring: "ring".into(),
+            first_seq: seq,
+            last_seq: seq,
+            bytes: vec![1; 100].into(),
+        };
+        for (bytes, went) in [(1 << 20, false), (1, true)] {
+            let storage = Database::default().open(dir.path(), site.clone(), clock(1000), bytes).await.expect("open");
+            storage.frames().append(vec![frame(bytes), frame(bytes + 1)]).await.expect("kept");
+            assert_eq!(storage.frames().prune().await.expect("pruned") > 0, went, "{bytes} bytes are kept");
+            storage.close().await;
+        }
+    }
 
     #[test]
     fn a_database_elsewhere_that_proves_nothing_is_refused_and_told_what_to_add() {

@@ -24,6 +24,7 @@ use midshift_proto::task::v1::{
     FlatTask, GetTaskRequest, ListTasksRequest, SubmitTaskRequest, TaskFilter, WatchTasksRequest,
     submit_task_request::Body,
 };
+use midshift_server::keep_limits::KeepLimits;
 use midshift_server::planning::Planning;
 use midshift_server::storage::{Database, Storage};
 use midshift_server::{Components, NaiveRules, Server};
@@ -121,7 +122,8 @@ impl Drop for Old {
 }
 
 async fn open(data: &Path, store: Option<String>, site: &Site) -> anyhow::Result<Storage> {
-    Database { store }.open(data, site.site_id().clone(), clock(1000)).await
+    let status_log_bytes = KeepLimits::default().status_log_bytes;
+    Database { store }.open(data, site.site_id().clone(), clock(1000), status_log_bytes).await
 }
 
 /// The files of an old site. They stay until the next run, which makes them anew.
@@ -193,6 +195,7 @@ impl Serving {
             naive: NaiveRules::default(),
             stops: None,
             stop_port: None,
+            keep: Default::default(),
             jumped_before: None,
             planning: planning.handle(),
             map: Default::default(),

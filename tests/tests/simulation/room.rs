@@ -317,6 +317,7 @@ fn serve(
                 let ota = software.open(clock.clone()).await?;
                 let parts = Components {
                     stop_port: None,
+                    keep: Default::default(),
                     jumped_before: None,
                     roles: Roles::default(),
                     drain: Duration::ZERO,

@@ -13,6 +13,7 @@ use midshift_core::limits;
 use midshift_core::time::Clock;
 use midshift_identity::{Duty, IdentityService, PUBLIC_FILE, Parts};
 use midshift_process::clock;
+use midshift_server::keep_limits::KeepLimits;
 use midshift_server::storage::Database;
 use rcgen::{
     BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
@@ -147,7 +148,7 @@ async fn get(args: Get, stop: CancellationToken, out: &Out) -> Result<(), Exit> 
     }
     let site_id = site_file::load(args.site.as_deref(), None, None)?.site.site_id().clone();
     let clock: Arc<dyn Clock> = clock::clock(1000);
-    let storage = args.database.open(&args.out, site_id, clock.clone()).await?;
+    let storage = args.database.open(&args.out, site_id, clock.clone(), KeepLimits::default().status_log_bytes).await?;
     let parts = Parts {
         folder: args.out.clone(),
         store: storage.store(),

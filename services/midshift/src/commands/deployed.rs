@@ -153,10 +153,11 @@ fn the_stop_service_beside_a_server_takes_the_same_peers_and_logs_in_the_same_fo
         let args = read_stop(&own);
         (args.log, args.share)
     };
-    let (log, share) =
-        told(&["--log", "json", "serve", "--connections-per-address", "8000", "--requests-per-second", "77"]);
+    let asked = ["--connections-per-address", "8000", "--requests-per-second", "77", "--watches-per-caller", "9"];
+    let (log, share) = told(&[&["--log", "json", "serve"][..], &asked].concat());
     assert_eq!(log, logs::Format::Json);
-    assert_eq!((share.connections_per_address, share.requests_per_second.get()), (Some(8_000), 77));
+    let requests = share.requests_per_second.map(std::num::NonZero::get);
+    assert_eq!((share.connections_per_address, requests, share.watches_per_caller), (Some(8_000), Some(77), Some(9)));
     let (log, share) = told(&["serve"]);
     assert_eq!((log, share.connections_per_address), (logs::Format::Text, None));
 }

@@ -35,7 +35,9 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-/// How often it is looked whether one that was started answers.
+/// How often it is looked whether one that was started answers: whoever starts a server waits for it.
+const ANSWER_EVERY: Duration = Duration::from_millis(5);
+/// How often one that runs is looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// One that has more than this begins anew, bytes.
 const LOG_BYTES_MAX: u64 = 4 * 1024 * 1024;
@@ -93,7 +95,7 @@ impl Supervisor {
             return Ok(None);
         }
         let mut child = self.spawn(program)?;
-        let mut waited = Duration::ZERO;
+        let begun = Instant::now();
         while !self.answers().await {
             if let Some(status) = child.try_wait()? {
                 bail!(
@@ -101,14 +103,13 @@ impl Supervisor {
                     self.data.join(FOLDER).join(LOG).display()
                 );
             }
-            if waited >= UP_WITHIN {
+            if begun.elapsed() >= UP_WITHIN {
                 bail!(
                     "the stop service at {listen} did not answer within {} s, or one of another site has the port; --no-stop if it runs elsewhere, --stop-listen for another port",
                     UP_WITHIN.as_secs()
                 );
             }
-            sleep(LOOK_EVERY).await;
-            waited += LOOK_EVERY;
+            sleep(ANSWER_EVERY).await;
         }
         tracing::info!(address = %listen, process = child.id(), "a stop service was started; it stays when this process ends");
         Ok(Some(child))

@@ -19,7 +19,7 @@ use midshift_core::site::{Site, file};
 use midshift_core::stop::{FOLDER, PORT};
 use midshift_core::{Boxed, limits};
 use midshift_os::told_to_end;
-use midshift_process::door::{self, Share};
+use midshift_process::door::Share;
 use midshift_process::{clock, logs, recorder};
 use std::io::Write;
 use std::net::SocketAddr;
@@ -138,7 +138,7 @@ async fn run_watched(args: Args, shutdown: CancellationToken, opened: &OnceLock<
     tracing::info!(address = %listener.local_addr()?, folder = %folder.display(), "midshift-stop serves: an operational stop request, not a safety function");
     let clock = clock::clock(1000);
     let (config, login) = match args.insecure {
-        true => (door::alone(port::NAME), None),
+        true => (args.share.config_without_login(port::NAME), None),
         false => (args.share.config(port::NAME)?, Some(principals::follow(&folder, &site, &clock).await?)),
     };
     let parts = Parts { folder, site: Some(site), clock };

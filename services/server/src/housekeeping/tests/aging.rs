@@ -146,10 +146,14 @@ impl World {
         }
     }
     async fn purge(&mut self) {
+        self.purge_down_to(u64::MAX).await;
+    }
+    /// Keeps at most so many entries of each log.
+    async fn purge_down_to(&mut self, log_entries_max: u64) {
         self.latch.forget(self.wall.now().wall, midshift_core::limits::RESETS_MAX);
         self.copy_stops().await;
         let (store, frames, clock) = (self.store.as_ref(), self.frames.as_ref(), self.wall.as_ref());
-        Turn { store, frames, clock, task: Some(&self.task) }.prune_all(|_| true).await;
+        Turn { store, frames, clock, task: Some(&self.task), log_entries_max }.prune_all(|_| true).await;
         for (writer, _) in Table::audits() {
             audit::maintain_chain(store, clock, *writer).await.expect("kept");
         }
@@ -230,6 +234,26 @@ async fn a_mark_that_nobody_moves_any_more_holds_entries_back_for_a_month_and_no
         left.push(told(&world).await);
     }
     assert_eq!(left, [2, 2, 1], "what both have read, then what roll-outs have not read for a month");
+}
+
+#[tokio::test]
+async fn of_a_log_so_many_entries_stay_as_are_kept_and_all_that_a_service_has_not_read() {
+    let wall = Arc::new(Wall(AtomicI64::new(BEGIN)));
+    let dir = tempfile::tempdir().expect("a folder");
+    let store = SqliteStore::open(dir.path(), site(), wall.clone()).await.expect("a store");
+    let frames = MemoryFrames::new(wall.clone(), u64::MAX);
+    let mut world = World::new(wall, Arc::new(store), Arc::new(frames)).await;
+    for _ in 0..5 {
+        world.write().await;
+    }
+    world.purge_down_to(2).await;
+    assert_eq!(told(&world).await, 5, "fleet has read nothing");
+    world.consume_all().await;
+    world.write().await;
+    world.purge_down_to(2).await;
+    assert_eq!(told(&world).await, 2);
+    world.purge().await;
+    assert_eq!(told(&world).await, 2, "they are young");
 }
 
 #[test]
