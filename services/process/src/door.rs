@@ -110,7 +110,7 @@ impl Login {
     /// # Errors
     /// What it is to prove itself with cannot be used.
     pub fn proves(&self) -> anyhow::Result<()> {
-        tls(&self.proof.borrow(), &self.clock).map(drop)
+        configure_tls(&self.proof.borrow(), &self.clock).map(drop)
     }
 }
 
@@ -142,7 +142,7 @@ async fn serve_all(
     let Login { site_id, clock, mut directory, mut proof, denials } = login;
     let known = Arc::new(SitePrincipals::new(site_id, clock.clone()));
     known.publish((**directory.borrow_and_update()).clone());
-    let tls = watch::Sender::new(tls(&proof.borrow_and_update().clone(), &clock)?);
+    let tls = watch::Sender::new(configure_tls(&proof.borrow_and_update().clone(), &clock)?);
     let edge = Edge::new(config, known.clone(), services).with_tls(tls.subscribe()).with_denials(denials);
     let following = async {
         while directory.changed().await.is_ok() {
@@ -153,7 +153,7 @@ async fn serve_all(
     let renewing = async {
         while proof.changed().await.is_ok() {
             let newest = proof.borrow_and_update().clone();
-            match self::tls(&newest, &clock) {
+            match configure_tls(&newest, &clock) {
                 Ok(newest) => drop(tls.send_replace(newest)),
                 Err(error) => tracing::error!(
                     error = format!("{error:#}"),
@@ -170,7 +170,11 @@ async fn serve_all(
     }
 }
 
-fn tls(proof: &ServerProof, clock: &Arc<dyn Clock>) -> anyhow::Result<Arc<ServerConfig>> {
+/// Makes the TLS of a port that proves itself with `proof` and asks whoever dials for a certificate of the site.
+///
+/// # Errors
+/// What the port is to prove itself with cannot be used.
+pub fn configure_tls(proof: &ServerProof, clock: &Arc<dyn Clock>) -> anyhow::Result<Arc<ServerConfig>> {
     let certificates = |pem: &str| -> anyhow::Result<Vec<CertificateDer<'static>>> {
         Ok(CertificateDer::pem_slice_iter(pem.as_bytes()).collect::<Result<_, _>>()?)
     };
