@@ -85,12 +85,16 @@ fn the_link_is_told_beside_a_bare_session_and_what_each_engine_can_do() {
 }
 
 #[test]
-fn a_stop_is_told_beside_a_bare_write_loop_under_each_load_and_with_each_thing_broken() {
+fn a_stop_is_told_beside_a_bare_loop_over_tls_under_each_load_and_with_each_thing_broken() {
     let records = records("stop", &["--robots", "6", "--rounds", "1", "--settle-ms", "100"]);
     assert_told(&records, &["P8"], 1);
     for beside in ["nothing beside", "knee", "downloads", "PostgreSQL stopped", "disk full", "server killed"] {
-        let told = records.iter().filter(|r| r["name"].as_str().is_some_and(|name| name.contains(beside)));
-        assert_eq!(told.count(), 5, "{beside}: {records:?}");
+        let told: Vec<_> =
+            records.iter().filter(|r| r["name"].as_str().is_some_and(|name| name.contains(beside))).collect();
+        let of = |words: &str| told.iter().filter(|r| r["name"].to_string().contains(words)).count();
+        assert_eq!((told.len(), of("plain write loop")), (6, 1), "{beside}: {records:?}");
+        let over_tls = |r: &&serde_json::Value| r["limit"]["name"].to_string().contains("TLS write loop");
+        assert!(told.iter().all(over_tls), "{beside}: {told:?}");
     }
 }
 

@@ -1,14 +1,18 @@
-//! P8: from an engaged stop to its acknowledgement by every robot, in turn with a bare loop that writes to as many sockets of the same process under the
-//! same load.
+//! P8: from an engaged stop to its acknowledgement by every robot, in turn with bare loops that write to as many sockets under the same load: one over TLS, as
+//! robots' lines are, and one in plain text.
 //!
-//! Invariant: the stop service is a process of its own on the first core, as is the bare loop; robots are on the others; robots' check-ins go on in the turns of both.
-//! Called by `main`. Rooms: `turns` has the turns and their figures; `disturbance` and `scene` are what goes on beside; `site` who may come in; `robots`, `fan` and `pull` are children.
+//! Invariant: the stop service is a process of its own on the first core, as is each bare loop; robots are on the others; robots' check-ins go on in the turns of all.
+//! Called by `main`. Rooms: `turns` has the turns and their figures; `simulators` the processes of robots; `disturbance` and `scene` are what goes on beside; `site`
+//! who may come in; `robots` with `readers`, `fan` and `pull` are children; `moments` is what they measure.
 
 mod disturbance;
 mod fan;
+mod moments;
 mod pull;
+mod readers;
 mod robots;
 mod scene;
+mod simulators;
 mod site;
 mod turns;
 
@@ -37,9 +41,13 @@ pub enum Part {
         #[arg(long)]
         data: PathBuf,
     },
-    /// The bare loop.
-    Fan,
-    /// Robots on both.
+    /// A bare loop.
+    Fan {
+        /// The data directory of the stop service whose TLS it speaks. Without it plain text.
+        #[arg(long)]
+        data: Option<PathBuf>,
+    },
+    /// Robots on all of them.
     Attend(robots::AttendArgs),
     /// Downloads without an end.
     Pull(pull::PullArgs),
@@ -62,7 +70,10 @@ pub async fn play(part: Part, address: SocketAddr, stop: CancellationToken) -> a
             };
             midshift_stop::program::run(serve, stop).await
         }
-        Part::Fan => fan::serve(address, stop).await,
+        Part::Fan { data } => {
+            let tls = data.as_deref().map(site::make_acceptor).transpose()?;
+            fan::serve(address, tls, stop).await
+        }
         Part::Attend(args) => {
             let all = Arc::new(robots::All::new(args));
             let asked = all.clone();

@@ -1,11 +1,12 @@
-//! Many robots on the stop service, and as many sockets on the bare fan-out, in one process.
+//! Many robots on the stop service, and as many sockets on each bare loop, in one process.
 //!
 //! A robot here is the smallest one that keeps its line: it takes over what it is told, checks in once a second, and says at once what it knows, obeys and stands by,
 //! then once more when it is durable, as the agent does (its file is in memory). It is resumed with the reset: nobody plans for it. It has no body and no ladder.
-//! Invariant: a line or a socket that ends ends the process, so that no robot is left out of a figure. Called by children only.
+//! Invariant: a line that ends ends the process, so that no robot is left out of a figure. Called by children only.
 
-use super::site::Proof;
-use super::{fan, site};
+use super::moments::{Moments, now_ns};
+use super::readers::Readers;
+use super::site::{self, Proof};
 use anyhow::{Context, bail};
 use midshift_agent::dial::{Dial, TcpDial};
 use midshift_core::limits;
@@ -16,11 +17,9 @@ use midshift_proto::stop::v1::stop_link_service_client::StopLinkServiceClient;
 use midshift_proto::stop::v1::{Attend, AttendRequest, CheckIn, SilenceStage};
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
 use tokio::sync::{Semaphore, mpsc};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, interval_at};
@@ -32,18 +31,22 @@ const OPENING: usize = 64;
 /// Check-ins on their way to the wire.
 const OUTBOUND: usize = 16;
 
-/// How many have both their line and their socket.
+/// How many have their line and their sockets, at most.
 pub const ATTACHED: &str = "attached";
 /// How many have the answer to a check-in that says they know a stop, and obey one.
 pub const STAND: &str = "stand";
 /// How many have the answer to a check-in that says they know of no stop.
 pub const FREE: &str = "free";
-/// How many have the answer to what they wrote to the bare fan-out since it was asked for last.
-pub const ANSWERED: &str = "answered";
+/// How many have the answer to what they wrote to the bare loop over TLS since it was asked for last.
+pub const ANSWERED_TLS: &str = "answered-tls";
+/// The same of the bare loop in plain text.
+pub const ANSWERED_PLAIN: &str = "answered-plain";
 /// Writes down when each was told and acknowledged; the answer is how many.
 pub const TAKE: &str = "take";
-/// The same of the bare fan-out.
-pub const TAKE_BARE: &str = "take-bare";
+/// The same of the bare loop over TLS.
+pub const TAKE_TLS: &str = "take-tls";
+/// The same of the bare loop in plain text.
+pub const TAKE_PLAIN: &str = "take-plain";
 
 /// What to be.
 #[derive(Clone, Debug, clap::Args)]
@@ -51,9 +54,12 @@ pub struct AttendArgs {
     /// The stop service, host:port.
     #[arg(long)]
     stop: String,
-    /// The bare fan-out.
+    /// The bare loop over TLS.
     #[arg(long)]
-    fan: SocketAddr,
+    tls_fan: SocketAddr,
+    /// The bare loop in plain text.
+    #[arg(long)]
+    plain_fan: SocketAddr,
     /// First robot of this process, from 0.
     #[arg(long)]
     from: usize,
@@ -68,30 +74,22 @@ pub struct AttendArgs {
     out: PathBuf,
 }
 
-/// When one robot was told and had the answer to its acknowledgement, ns of the machine's monotonic clock.
-#[derive(Clone, Copy, Debug, Default, serde::Serialize, serde::Deserialize)]
-pub struct Moments {
-    /// It read the stop.
-    pub told_ns: u64,
-    /// It read the answer to what it said then. 0: not yet.
-    pub acked_ns: u64,
-}
-
 /// What is known of one robot.
 #[derive(Default)]
 struct Seen {
     is_synced: bool,
-    has_socket: bool,
     stops: BTreeSet<String>,
     /// All that it was told is in a check-in that was answered.
     is_answered: bool,
     stop: Moments,
-    bare: Moments,
 }
 
 /// All of this process.
 pub struct All {
     robots: Vec<Mutex<Seen>>,
+    tls: Readers,
+    plain: Readers,
+    opening: Semaphore,
     args: AttendArgs,
 }
 
@@ -102,7 +100,9 @@ fn lock(seen: &Mutex<Seen>) -> MutexGuard<'_, Seen> {
 impl All {
     /// None of them attached yet.
     pub fn new(args: AttendArgs) -> Self {
-        Self { robots: (args.from..args.to).map(|_| Mutex::default()).collect(), args }
+        let robots: Vec<_> = (args.from..args.to).map(|_| Mutex::default()).collect();
+        let [tls, plain] = [robots.len(); 2].map(Readers::new);
+        Self { robots, tls, plain, opening: Semaphore::new(OPENING), args }
     }
     fn count(&self, is_so: impl Fn(&Seen) -> bool) -> u64 {
         self.robots.iter().filter(|robot| is_so(&lock(robot))).count() as u64
@@ -110,32 +110,43 @@ impl All {
     /// See the questions.
     pub fn answer(&self, question: &str) -> u64 {
         match question {
-            ATTACHED => self.count(|seen| seen.is_synced && seen.has_socket),
+            ATTACHED => self.count(|seen| seen.is_synced).min(self.tls.count_open()).min(self.plain.count_open()),
             STAND => self.count(|seen| !seen.stops.is_empty() && seen.is_answered),
             FREE => self.count(|seen| seen.stops.is_empty() && seen.is_answered),
-            ANSWERED => self.count(|seen| seen.bare.acked_ns > 0),
-            TAKE => self.write(&self.args.out, |seen| &mut seen.stop),
-            TAKE_BARE => self.write(&self.args.out, |seen| &mut seen.bare),
+            ANSWERED_TLS => self.tls.count_answered(),
+            ANSWERED_PLAIN => self.plain.count_answered(),
+            TAKE => self.write(&self.take_stops()),
+            TAKE_TLS => self.write(&self.tls.take_moments()),
+            TAKE_PLAIN => self.write(&self.plain.take_moments()),
             _ => 0,
         }
     }
-    /// Writes moments down and begins anew.
-    fn write(&self, out: &Path, which: impl Fn(&mut Seen) -> &mut Moments) -> u64 {
-        let taken = |robot| std::mem::take(which(&mut lock(robot)));
-        let all: Vec<Moments> = self.robots.iter().map(taken).collect();
-        let written = serde_json::to_vec(&all).ok().and_then(|text| std::fs::write(out, text).ok());
-        written.map_or(0, |()| all.len() as u64)
+    /// Takes the moments of stops and begins anew.
+    fn take_stops(&self) -> Vec<Moments> {
+        self.robots.iter().map(|robot| std::mem::take(&mut lock(robot).stop)).collect()
+    }
+    /// Writes moments down; the answer is how many.
+    fn write(&self, moments: &[Moments]) -> u64 {
+        let written = serde_json::to_vec(moments).ok().and_then(|text| std::fs::write(&self.args.out, text).ok());
+        written.map_or(0, |()| moments.len() as u64)
     }
 }
 
 /// Keeps all of them attached until `stop`.
 pub async fn run(all: Arc<All>, stop: CancellationToken) -> anyhow::Result<()> {
-    let opening = Arc::new(Semaphore::new(OPENING));
     let mut tasks = JoinSet::new();
+    let dial = |address: &str| TcpDial::new(address, None);
     for (at, proof) in Proof::read(&all.args.proofs)?.into_iter().enumerate() {
-        let (line, socket) = ((all.clone(), opening.clone()), (all.clone(), opening.clone()));
-        tasks.spawn(async move { attend(&line.0, &proof, at, &line.1).await });
-        tasks.spawn(async move { read_fan(&socket.0, at, &socket.1).await });
+        let tls = proof.tls()?;
+        let line = dial(&format!("https://{}", all.args.stop))?.with_tls(tls.clone());
+        let over_tls = dial(&format!("https://{}", all.args.tls_fan))?.with_tls(tls);
+        let plain = dial(&format!("http://{}", all.args.plain_fan))?;
+        let robots = all.clone();
+        tasks.spawn(async move { attend(&robots, line, at).await });
+        let robots = all.clone();
+        tasks.spawn(async move { robots.tls.read_frames(at, over_tls, &robots.opening).await });
+        let robots = all.clone();
+        tasks.spawn(async move { robots.plain.read_frames(at, plain, &robots.opening).await });
     }
     tokio::select! {
         ended = tasks.join_next() => ended.context("no robots")??,
@@ -144,9 +155,9 @@ pub async fn run(all: Arc<All>, stop: CancellationToken) -> anyhow::Result<()> {
 }
 
 /// One robot on its stop line, to its end.
-async fn attend(all: &All, proof: &Proof, at: usize, opening: &Semaphore) -> anyhow::Result<()> {
-    let permit = opening.acquire().await?;
-    let channel = TcpDial::new(&format!("https://{}", all.args.stop), None)?.with_tls(proof.tls()?).dial().await?;
+async fn attend(all: &All, dial: TcpDial, at: usize) -> anyhow::Result<()> {
+    let permit = all.opening.acquire().await?;
+    let channel = dial.dial().await?;
     let (up, outbound) = mpsc::channel(OUTBOUND);
     let robot_id = site::robot_id(all.args.from + at);
     let first = Attend { boot_id: format!("{robot_id}-boot"), robot_id, ..Attend::default() };
@@ -183,7 +194,7 @@ struct Robot<'a> {
 
 impl Robot<'_> {
     async fn take_message(&mut self, message: Down, facts_generation: u64) -> anyhow::Result<()> {
-        let now_ns = fan::now_ns();
+        let now_ns = now_ns();
         match message {
             Down::Facts(facts) => {
                 let is_synced = {
@@ -242,23 +253,5 @@ impl Robot<'_> {
             without_people: false,
         };
         self.up.send(AttendRequest { message: Some(Up::CheckIn(check_in)) }).await.context("the line has ended")
-    }
-}
-
-/// One socket of the bare fan-out, to its end.
-async fn read_fan(all: &All, at: usize, opening: &Semaphore) -> anyhow::Result<()> {
-    let permit = opening.acquire().await?;
-    let mut stream = TcpStream::connect(all.args.fan).await?;
-    stream.set_nodelay(true)?;
-    drop(permit);
-    let seen = &all.robots[at];
-    lock(seen).has_socket = true;
-    let (mut frame, mut answer) = ([0; fan::FRAME_BYTES], [0; fan::ANSWER_BYTES]);
-    loop {
-        stream.read_exact(&mut frame).await.context("the bare fan-out ended")?;
-        let told_ns = fan::now_ns();
-        stream.write_all(&[1; fan::ACK_BYTES]).await?;
-        stream.read_exact(&mut answer).await?;
-        lock(seen).bare = Moments { told_ns, acked_ns: fan::now_ns() };
     }
 }

@@ -1,10 +1,11 @@
 //! What goes on beside a stop: nothing, ingest at the knee, downloads, a database that hangs, a disk without room, a server that is killed.
 //!
-//! Invariant: the load is there in the turns of both; whatever was mounted or stopped is unmounted or goes on however the measurement ends.
+//! Invariant: the load is there in the turns of all; whatever was mounted or stopped is unmounted or goes on however the measurement ends.
 
 use super::disturbance::Disturbance;
+use super::simulators::text;
 use super::site::Site;
-use super::turns::{StopArgs, Turns, text, turns};
+use super::turns::{StopArgs, Turns, turns};
 use crate::child::Child;
 use crate::engine::{Engine, children_of};
 use crate::fsync::place;

@@ -1,13 +1,14 @@
 //! The site of the measurement: its authority, a person who may stop, and robots that are enrolled, as the real service makes them.
 //!
-//! Invariant: made once for all robots of a run, before anything is measured; nothing of it runs then. Called by the parent; robots of children read theirs.
+//! Invariant: made once for all robots of a run, before anything is measured; nothing of it runs then. Called by the parent; children read theirs.
 
 use anyhow::Context;
 use midshift_agent::tls::{self, Tls};
 use midshift_cli::endpoint::Endpoint;
 use midshift_core::ids::SiteId;
 use midshift_core::time::Clock;
-use midshift_identity::{Duty, IdentityService, Parts};
+use midshift_identity::{Duty, IdentityService, Parts, ServerProof};
+use midshift_process::door;
 use midshift_proto::access::local;
 use midshift_proto::identity::v1::enrolment_service_server::EnrolmentService as _;
 use midshift_proto::identity::v1::identity_service_server::IdentityService as _;
@@ -20,6 +21,7 @@ use std::fs::DirBuilder;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::Path;
 use std::sync::Arc;
+use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 
 /// As the built-in demo site is named: the stop service of the measurement serves it.
@@ -73,7 +75,7 @@ impl Site {
             proofs.push(enrolled(&identity, robot_id(at)).await?);
         }
         let (directory, proof) = (identity.directory().borrow().as_ref().clone(), identity.proof().borrow().clone());
-        let midshift_identity::ServerProof { chain_pem, key_pem, authority_pem } = proof;
+        let ServerProof { chain_pem, key_pem, authority_pem } = proof;
         Ok(Self { principals: Principals { directory, chain_pem, key_pem, authority_pem }, token, proofs })
     }
     /// Writes down who is known for a stop service with this data folder.
@@ -93,6 +95,15 @@ impl Site {
     pub fn way(&self, address: &str) -> anyhow::Result<Endpoint> {
         Endpoint::secure(address, &self.principals.authority_pem, Some(&self.token))
     }
+}
+
+/// Makes TLS as the port of the stop service with this data folder speaks it: with the same certificate, and asking robots for theirs.
+pub fn make_acceptor(data: &Path) -> anyhow::Result<TlsAcceptor> {
+    let folder = data.join(midshift_core::stop::FOLDER);
+    let known = Principals::read(&folder)?.context("a data folder that does not say who is known")?;
+    let Principals { chain_pem, key_pem, authority_pem, .. } = known;
+    let proof = ServerProof { chain_pem, key_pem, authority_pem };
+    Ok(door::configure_tls(&proof, &midshift_process::clock::clock(1000))?.into())
 }
 
 async fn enrolled(identity: &IdentityService, robot_id: String) -> anyhow::Result<Proof> {
