@@ -97,15 +97,19 @@ fn figures_of(on: &str, starts: &Starts, bare: &[f64]) -> Vec<Figure> {
     ]
 }
 
-/// A process that is asked to end when it goes, and waited for.
-struct Ended(std::process::Child);
+/// A server that is asked to end when it goes, and the stop service that it started.
+struct Running {
+    server: std::process::Child,
+    stop_folder: PathBuf,
+}
 
-impl Drop for Ended {
+impl Drop for Running {
     fn drop(&mut self) {
-        if let Some(pid) = i32::try_from(self.0.id()).ok().and_then(Pid::from_raw) {
+        if let Some(pid) = i32::try_from(self.server.id()).ok().and_then(Pid::from_raw) {
             let _ = kill_process(pid, Signal::TERM);
         }
-        let _ = self.0.wait();
+        let _ = self.server.wait();
+        let _ = midshift_stop::end_holder(&self.stop_folder);
     }
 }
 
@@ -118,16 +122,16 @@ async fn start(args: &StartArgs, data: &Path, starts: &mut Starts) -> anyhow::Re
     command.args(["serve", "--insecure", "--listen", &listen.to_string(), "--stop-listen", &stop_listen.to_string()]);
     command.arg("--data").arg(data).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
     let begun = Instant::now();
-    let server = Ended(command.spawn().context("starting midshift")?);
+    let server = command.spawn().context("starting midshift")?;
+    let running = Running { server, stop_folder: data.join(midshift_core::stop::FOLDER) };
     submit_first(listen).await?;
     starts.answer_ms.push(begun.elapsed().as_secs_f64() * 1e3);
     sleep(Duration::from_secs(args.settle_seconds)).await;
-    starts.server.push(Memory::read(server.0.id())?);
-    for stop_service in children_of(server.0.id())? {
+    let server = running.server.id();
+    starts.server.push(Memory::read(server)?);
+    for stop_service in children_of(server)? {
         starts.stop_service.push(Memory::read(stop_service)?);
     }
-    drop(server);
-    midshift_stop::end_holder(&data.join(midshift_core::stop::FOLDER))?;
     Ok(())
 }
 

@@ -202,3 +202,23 @@ fn the_gates_are_as_often_right_as_the_design_says_and_a_seed_says_it_again() {
     assert_eq!(gates("7"), records, "the same seed");
     assert_ne!(gates("8"), records, "another seed");
 }
+
+#[test]
+fn starts_and_returns_are_told_of_the_programs_as_they_are_released() {
+    let Some(beside) = std::path::Path::new(env!("CARGO_BIN_EXE_midshift-bench")).parent() else { panic!("a folder") };
+    assert!(beside.join("midshift").exists(), "the whole workspace is built first");
+    let sizes = ["--ended", "200", "--robots", "4", "--rounds", "1", "--settle-seconds", "0"];
+    let records = records("start", &sizes);
+    for name in ["a new folder", "an empty store", "an old store"] {
+        let told = records.iter().filter(|r| r["name"].as_str().is_some_and(|told| told.starts_with(name)));
+        assert_eq!(told.count(), 5, "{records:?}");
+    }
+    assert!(records.iter().any(|r| r["target"] == "P10" && r["median"].as_f64().is_some_and(|ms| ms > 0.0)));
+}
+
+#[test]
+fn reads_are_told_beside_a_call_that_reads_nothing_on_each_engine() {
+    let records = records("reads", &["--ended", "200", "--calls", "5", "--rounds", "1"]);
+    assert_told(&records, &["R1"], 1);
+    assert_both_engines(&records, &["health check"]);
+}

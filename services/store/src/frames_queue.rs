@@ -1,4 +1,4 @@
-//! The way to the one writer task of a frame log: appends queue while one commit runs, and the next transaction takes them all.
+//! The way to the one writer task of a frame log: one call is one transaction. Telemetry gathers the frames of a call.
 //!
 //! Invariant: nobody is told "durable" before the commit of the engine ([`FramesEngine`]) has returned.
 
@@ -18,9 +18,8 @@ use tokio::sync::{mpsc, oneshot};
 const QUEUE_COMMANDS: usize = 1_024;
 /// Rows of one page of [`crate::FrameLog::read`].
 pub(crate) const READ_ROWS: i64 = 64;
-/// Samples of one `frame_log` row, and bytes of one transaction, about.
+/// Samples of one `frame_log` row, about.
 const ROW_SAMPLES: u64 = 2_000;
-const GROUP_BYTES: usize = 1024 * 1024;
 /// Gaps kept, newest first.
 pub(crate) const GAPS_KEPT: i64 = 1_000_000;
 
@@ -39,7 +38,7 @@ pub(crate) enum Command {
 
 /// What the writer task drives: one engine's side of the log.
 pub(crate) trait FramesEngine: Send + 'static {
-    /// Appends the frames of one group in one transaction.
+    /// Appends frames in one transaction.
     fn append(&mut self, frames: &[Frame], rows: &[Packed]) -> impl Future<Output = Result<(), Error>> + Send;
     /// As [`crate::FrameLog::marks`].
     fn marks(&mut self) -> impl Future<Output = Result<Vec<FrameMark>, Error>> + Send;
@@ -66,24 +65,16 @@ pub(crate) struct Packed {
 
 /// Serves the queue until it is closed or nobody can ask any more.
 pub(crate) async fn run(mut engine: impl FramesEngine, mut queue: mpsc::Receiver<Command>) {
-    let (mut put_back, mut compressor) = (None, None);
-    loop {
-        let command = match put_back.take() {
-            Some(command) => command,
-            None => match queue.recv().await {
-                Some(command) => command,
-                None => return,
-            },
-        };
+    let mut compressor = None;
+    while let Some(command) = queue.recv().await {
         // Who asked may have stopped waiting; the work is done all the same.
         match command {
             Command::Append { frames, reply } => {
-                let (frames, replies) = gather(frames, reply, &mut queue, &mut put_back);
                 let outcome = match packed(&frames, &mut compressor) {
                     Ok(rows) => engine.append(&frames, &rows).await,
                     Err(error) => Err(error),
                 };
-                replies.into_iter().for_each(|reply| drop(reply.send(outcome.clone())));
+                drop(reply.send(outcome));
             }
             Command::Marks { reply } => drop(reply.send(engine.marks().await)),
             Command::Forget { marks, reply } => drop(reply.send(engine.forget(&marks).await)),
@@ -97,31 +88,6 @@ pub(crate) async fn run(mut engine: impl FramesEngine, mut queue: mpsc::Receiver
             }
         }
     }
-}
-
-fn gather(
-    mut frames: Vec<Frame>,
-    reply: Reply<()>,
-    queue: &mut mpsc::Receiver<Command>,
-    put_back: &mut Option<Command>,
-) -> (Vec<Frame>, Vec<Reply<()>>) {
-    let mut replies = vec![reply];
-    let mut bytes: usize = frames.iter().map(|f| f.bytes.len()).sum();
-    while bytes < GROUP_BYTES {
-        match queue.try_recv() {
-            Ok(Command::Append { frames: more, reply }) => {
-                bytes += more.iter().map(|f| f.bytes.len()).sum::<usize>();
-                frames.extend(more);
-                replies.push(reply);
-            }
-            Ok(other) => {
-                *put_back = Some(other);
-                break;
-            }
-            Err(_) => break,
-        }
-    }
-    (frames, replies)
 }
 
 fn packed(frames: &[Frame], compressor: &mut Option<RowCompressor>) -> Result<Vec<Packed>, Error> {
