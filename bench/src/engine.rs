@@ -2,7 +2,7 @@
 //! single commit by itself and rows by COPY.
 //!
 //! Invariant: each round has a directory or a database of its own, taken away with it. PostgreSQL keeps its promises: `fsync` is on and
-//! a commit waits for its log. Called by `plan`, `submit`, `offer`, `link` and `stop`.
+//! a commit waits for its log. Called by each measurement of a server.
 
 use crate::child::{Child, cpu_of_ended_s, cpu_of_s};
 use crate::durable_baseline::DurableBaseline;

@@ -1,4 +1,5 @@
-//! What calls cost that only read, one at a time, at a site where thousands of tasks are over: time of each call, and CPU of the server.
+//! What calls cost that only read, one at a time, at a site where thousands of tasks are over: time of each call, and CPU of the server, without
+//! that of a database beside it.
 
 use crate::child::Child;
 use crate::engine::{Bed, Engine, EngineArgs};
@@ -15,6 +16,8 @@ use midshift_proto::telemetry::v1::telemetry_service_client::TelemetryServiceCli
 use midshift_server::storage::Database;
 use tokio::time::Instant;
 use tonic::transport::Channel;
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_client::HealthClient;
 
 /// What to measure.
 #[derive(Clone, Debug, clap::Args)]
@@ -99,15 +102,15 @@ async fn measure(args: &ReadsArgs, engine: &Engine, say: &dyn Fn(&str)) -> anyho
     let server = serve_old_site(args, &bed).await?;
     let mut client = Client::connect(&server).await?;
     let mut rounds: Vec<Vec<Round>> = Call::ALL.iter().map(|_| Vec::new()).collect();
-    let mut raw_ms = Vec::new();
+    let mut health = Vec::new();
     for number in 1..=args.rounds {
-        raw_ms.push(client.raw_ms(args.calls).await?);
+        health.push(client.round(None, args.calls, &server).await?);
         for (call, rounds) in Call::ALL.into_iter().zip(&mut rounds) {
-            rounds.push(client.round(call, call.times(args.calls), &server).await?);
+            rounds.push(client.round(Some(call), call.times(args.calls), &server).await?);
         }
         say(&format!("round {number}{} is over", engine.suffix()));
     }
-    Ok(Call::ALL.iter().zip(&rounds).flat_map(|(call, rounds)| figures(*call, engine, rounds, &raw_ms)).collect())
+    Ok(Call::ALL.iter().zip(&rounds).flat_map(|(call, rounds)| figures(*call, engine, rounds, &health)).collect())
 }
 
 async fn serve_old_site(args: &ReadsArgs, bed: &Bed<'_>) -> anyhow::Result<Child> {
@@ -118,20 +121,22 @@ async fn serve_old_site(args: &ReadsArgs, bed: &Bed<'_>) -> anyhow::Result<Child
     bed.serve(None, None).await
 }
 
-fn figures(call: Call, engine: &Engine, rounds: &[Round], raw_ms: &[f64]) -> [Figure; 3] {
-    let name = |what: &str| format!("{}, {what}{}", call.name(), engine.suffix());
-    let beside: Option<(&str, &[f64])> = Some(("health check of the same server, p50", raw_ms));
-    let each = |share: f64| rounds.iter().map(|round| percentile(&round.took_ms, share)).collect::<Vec<_>>();
-    let cpu: Vec<f64> = rounds.iter().map(|round| round.cpu_ms).collect();
+/// Each beside the same of a call that reads nothing.
+fn figures(call: Call, engine: &Engine, rounds: &[Round], health: &[Round]) -> [Figure; 3] {
+    let figure = |what: &str, of: &dyn Fn(&Round) -> f64| {
+        let [values, limit] = [rounds, health].map(|rounds| rounds.iter().map(of).collect::<Vec<_>>());
+        let (name, told) = (format!("{}, {what}{}", call.name(), engine.suffix()), format!("health check, {what}"));
+        Figure::new("R1", name, "ms", &values, Some((&told, &limit)))
+    };
     [
-        Figure::new("R1", name("p50"), "ms", &each(0.5), beside),
-        Figure::new("R1", name("p99"), "ms", &each(0.99), beside),
-        Figure::new("R1", name("CPU of the server each"), "ms", &cpu, beside),
+        figure("p50", &|round| percentile(&round.took_ms, 0.5)),
+        figure("p99", &|round| percentile(&round.took_ms, 0.99)),
+        figure("CPU of the server each", &|round| round.cpu_ms),
     ]
 }
 
 struct Client {
-    channel: Channel,
+    health: HealthClient<Channel>,
     tasks: TaskServiceClient<Channel>,
     robots: TelemetryServiceClient<Channel>,
     /// Of a task that is over, and the robot that did it.
@@ -146,26 +151,19 @@ impl Client {
         let page = tasks.list_tasks(ListTasksRequest { page_size: 1, ..ListTasksRequest::default() }).await?;
         let task = page.into_inner().tasks.pop().context("no task is over")?;
         let robots = TelemetryServiceClient::new(channel.clone());
-        Ok(Self { channel, tasks, robots, task_id: task.task_id, robot_id: task.robot_id })
+        let health = HealthClient::new(channel);
+        Ok(Self { health, tasks, robots, task_id: task.task_id, robot_id: task.robot_id })
     }
 
-    /// Median of a call that reads nothing.
-    async fn raw_ms(&self, calls: usize) -> anyhow::Result<f64> {
-        let mut health = tonic_health::pb::health_client::HealthClient::new(self.channel.clone());
-        let mut took_ms = Vec::with_capacity(calls);
-        for _ in 0..calls {
-            let begun = Instant::now();
-            health.check(tonic_health::pb::HealthCheckRequest::default()).await?;
-            took_ms.push(begun.elapsed().as_secs_f64() * 1e3);
-        }
-        Ok(percentile(&took_ms, 0.5))
-    }
-
-    async fn round(&mut self, call: Call, times: usize, server: &Child) -> anyhow::Result<Round> {
+    /// Asks for one kind of call again and again; none: for the health of the server, which reads nothing.
+    async fn round(&mut self, call: Option<Call>, times: usize, server: &Child) -> anyhow::Result<Round> {
         let (before_s, mut took_ms) = (server.cpu_s()?, Vec::with_capacity(times));
         for _ in 0..times {
             let begun = Instant::now();
-            self.ask(call).await?;
+            match call {
+                Some(call) => self.ask(call).await?,
+                None => drop(self.health.check(HealthCheckRequest::default()).await?),
+            }
             took_ms.push(begun.elapsed().as_secs_f64() * 1e3);
         }
         Ok(Round { took_ms, cpu_ms: server.cpu_since_s(before_s)? * 1e3 / times as f64 })

@@ -1,16 +1,19 @@
 //! P10 and P12: how long a server takes from its start to its first durable answer, what it takes without robots, and how soon robots are back
-//! after it was killed. The programs are those beside this one, as they are released.
+//! after it was killed.
+//!
+//! Starts are of the program beside this one, as it is released, with a stop service. Robots come back to a child of this program, without one.
 
 use crate::child::Child;
 use crate::engine::children_of;
 use crate::figure::Figure;
 use crate::fsync::place;
 use crate::old_site::OldSite;
+use crate::outcome::unless_stopped;
 use crate::simulators::{await_sessions, start_robots};
 use crate::submit::transports;
 use crate::usage::Memory;
 use crate::{grid_map, old_tables};
-use anyhow::{Context, ensure};
+use anyhow::{Context, anyhow, ensure};
 use midshift_agent::clock::wall;
 use midshift_core::site::{DEMO, text};
 use midshift_proto::task::v1::SubmitTaskRequest;
@@ -26,6 +29,8 @@ use tonic::transport::Endpoint;
 
 /// The first durable answer is there by then.
 const WITHIN: Duration = Duration::from_secs(60);
+/// A stop service that was ended lets go of its folder by then.
+const GONE_WITHIN: Duration = Duration::from_secs(2);
 /// How often a server that does not answer yet is asked again.
 const ASK_EVERY: Duration = Duration::from_millis(1);
 
@@ -49,7 +54,7 @@ pub struct StartArgs {
     dir: Option<PathBuf>,
 }
 
-/// Starts of one kind.
+/// What was measured of the starts of one kind.
 #[derive(Default)]
 struct Starts {
     answer_ms: Vec<f64>,
@@ -57,8 +62,14 @@ struct Starts {
     stop_service: Vec<Memory>,
 }
 
-/// Runs each kind of start, then kills.
+/// Runs each kind of start, then kills; ends early, and what it started with it, when somebody asks for that.
 pub async fn run(args: StartArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> {
+    let mut measured = Err(anyhow!("nothing was measured"));
+    let stopped = unless_stopped(async { measured = measure(&args, say).await }).await;
+    stopped.map_or(measured, |why| Err(anyhow!(why)))
+}
+
+async fn measure(args: &StartArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> {
     let (mut first, mut again, mut old, mut bare) = <(Starts, Starts, Starts, Vec<f64>)>::default();
     let old_room = place(args.dir.as_ref())?;
     let database = Database { store: None };
@@ -69,17 +80,17 @@ pub async fn run(args: StartArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figu
         let room = place(args.dir.as_ref())?;
         bare.push(start_bare_ms(room.path()).await?);
         let data = room.path().join("data");
-        start(&args, &data, &mut first).await?;
-        start(&args, &data, &mut again).await?;
-        start(&args, &old_data, &mut old).await?;
+        start(args, &data, &mut first).await?;
+        start(args, &data, &mut again).await?;
+        start(args, &old_data, &mut old).await?;
         say(&format!("round {round} of the starts is over"));
     }
     let mut figures = Vec::new();
-    for (name, starts) in [("a new folder", &first), ("an empty store", &again), ("an old store", &old)] {
+    for (name, starts) in [("a new folder", &first), ("a store with one task", &again), ("an old store", &old)] {
         figures.extend(figures_of(name, starts, &bare));
     }
     for robots in &args.robots {
-        figures.push(measure_return(&args, *robots, say).await?);
+        figures.push(measure_return(args, *robots, say).await?);
     }
     Ok(figures)
 }
@@ -110,6 +121,10 @@ impl Drop for Running {
         }
         let _ = self.server.wait();
         let _ = midshift_stop::end_holder(&self.stop_folder);
+        let end = Instant::now() + GONE_WITHIN;
+        while midshift_stop::is_held(&self.stop_folder) && Instant::now() < end {
+            std::thread::sleep(ASK_EVERY);
+        }
     }
 }
 
@@ -117,7 +132,7 @@ impl Drop for Running {
 async fn start(args: &StartArgs, data: &Path, starts: &mut Starts) -> anyhow::Result<()> {
     let program = std::env::current_exe()?.with_file_name("midshift");
     ensure!(program.exists(), "{} is missing: cargo build --release", program.display());
-    let (listen, stop_listen) = (free_address()?, free_address()?);
+    let (listen, stop_listen) = (find_free_address()?, find_free_address()?);
     let mut command = std::process::Command::new(program);
     command.args(["serve", "--insecure", "--listen", &listen.to_string(), "--stop-listen", &stop_listen.to_string()]);
     command.arg("--data").arg(data).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
@@ -135,19 +150,20 @@ async fn start(args: &StartArgs, data: &Path, starts: &mut Starts) -> anyhow::Re
     Ok(())
 }
 
-fn free_address() -> anyhow::Result<SocketAddr> {
+fn find_free_address() -> anyhow::Result<SocketAddr> {
     Ok(std::net::TcpListener::bind("127.0.0.1:0")?.local_addr()?)
 }
 
-/// Submits a task until one is durable.
+/// Submits a task that was never submitted before until it is durable.
 async fn submit_first(server: SocketAddr) -> anyhow::Result<()> {
     let request = transports(&text::parse(DEMO)?, 1)?.pop().context("no transport")?;
     let endpoint = Endpoint::from_shared(format!("http://{server}"))?.tcp_nodelay(true);
+    let request = SubmitTaskRequest { request_id: format!("bench-{:016x}", rand::random::<u64>()), ..request };
     let end = Instant::now() + WITHIN;
     loop {
         let submitted = async {
-            let request = SubmitTaskRequest { request_id: "bench-first".to_owned(), ..request.clone() };
-            TaskServiceClient::new(endpoint.connect().await?).submit_task(request).await.map_err(anyhow::Error::from)
+            let mut client = TaskServiceClient::new(endpoint.connect().await?);
+            client.submit_task(request.clone()).await.map_err(anyhow::Error::from)
         };
         match submitted.await {
             Ok(_) => return Ok(()),
@@ -157,7 +173,7 @@ async fn submit_first(server: SocketAddr) -> anyhow::Result<()> {
     }
 }
 
-/// From the start of a bare tonic service to its first answer.
+/// Measures a bare tonic service from its start to its first answer.
 async fn start_bare_ms(room: &Path) -> anyhow::Result<f64> {
     let answer = room.join("answer");
     std::fs::write(&answer, b"")?;
@@ -167,7 +183,7 @@ async fn start_bare_ms(room: &Path) -> anyhow::Result<f64> {
     Ok(begun.elapsed().as_secs_f64() * 1e3)
 }
 
-/// From the start of a server whose predecessor was killed until it has the sessions of all robots again.
+/// Kills a server and starts another one: from the kill until that has the sessions of all robots again.
 async fn measure_return(args: &StartArgs, robots: usize, say: &dyn Fn(&str)) -> anyhow::Result<Figure> {
     let room = place(args.dir.as_ref())?;
     let map = grid_map::write(room.path(), (robots as f64).sqrt() as usize + 2)?;
@@ -178,8 +194,9 @@ async fn measure_return(args: &StartArgs, robots: usize, say: &dyn Fn(&str)) -> 
     await_sessions(&mut server, robots).await?;
     let mut back_ms = Vec::new();
     for round in 1..=args.rounds {
-        drop(server);
         let begun = Instant::now();
+        // SIGKILL.
+        drop(server);
         server = Child::serve_at(Some(listen), &data, Some(&map), None, Some(0)).await?;
         await_sessions(&mut server, robots).await?;
         back_ms.push(begun.elapsed().as_secs_f64() * 1e3);

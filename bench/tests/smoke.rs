@@ -204,12 +204,12 @@ fn the_gates_are_as_often_right_as_the_design_says_and_a_seed_says_it_again() {
 }
 
 #[test]
-fn starts_and_returns_are_told_of_the_programs_as_they_are_released() {
+fn starts_are_told_of_the_program_as_it_is_released_and_returns_of_robots() {
     let Some(beside) = std::path::Path::new(env!("CARGO_BIN_EXE_midshift-bench")).parent() else { panic!("a folder") };
     assert!(beside.join("midshift").exists(), "the whole workspace is built first");
     let sizes = ["--ended", "200", "--robots", "4", "--rounds", "1", "--settle-seconds", "0"];
     let records = records("start", &sizes);
-    for name in ["a new folder", "an empty store", "an old store"] {
+    for name in ["a new folder", "a store with one task", "an old store"] {
         let told = records.iter().filter(|r| r["name"].as_str().is_some_and(|told| told.starts_with(name)));
         assert_eq!(told.count(), 5, "{records:?}");
     }

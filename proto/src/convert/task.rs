@@ -445,7 +445,7 @@ impl TaskFilter {
     }
 
     /// Whether it asks for anything of an intake but its id.
-    pub fn asks_intake(&self) -> bool {
+    pub fn has_intake_conditions(&self) -> bool {
         !(self.kinds.is_empty() && self.labels.is_empty() && self.external_ref.is_empty())
             || self.created_after.is_some()
             || self.created_before.is_some()

@@ -43,15 +43,15 @@ impl Share {
         const PART: usize = limits::CONNECTIONS_MAX / limits::CONNECTIONS_PER_NETWORK_MAX;
         let connections_max = connections_max()?;
         let usual = Config { port, connections_max, ..Config::default() };
-        Ok(self.over(Config { connections_per_network_max: connections_max / PART, ..usual }))
+        Ok(self.apply_to(Config { connections_per_network_max: connections_max / PART, ..usual }))
     }
 
-    /// The limits of a port without login: those that were asked for, beside the port's own.
+    /// Makes the limits of a port without login: those that were asked for, beside the port's own.
     pub fn config_without_login(self, port: &'static str) -> Config {
-        self.over(alone(port))
+        self.apply_to(alone(port))
     }
 
-    fn over(self, usual: Config) -> Config {
+    fn apply_to(self, usual: Config) -> Config {
         const BURST: NonZeroU32 = NonZeroU32::new(limits::REQUESTS_BURST / limits::REQUESTS_PER_SECOND).unwrap();
         let rate = |per_second: NonZeroU32| Rate { per_second, burst: per_second.saturating_mul(BURST) };
         let connections = self.connections_per_address.map(|asked| asked.min(usual.connections_max));

@@ -10,7 +10,7 @@ const ENTRIES_DEFAULT: u64 = 20_000_000;
 pub struct KeepLimits {
     /// Bytes of STATUS samples kept at most, packed, without the database's own overhead; older ones go before their 30 days are over. The same for each gateway
     /// of a site: the smallest counts.
-    #[arg(long, value_name = "BYTES", default_value_t = FRAME_BYTES_DEFAULT, value_parser = clap::value_parser!(u64).range(1_048_576..))]
+    #[arg(long, value_name = "BYTES", default_value_t = FRAME_BYTES_DEFAULT, value_parser = clap::value_parser!(u64).range(1_048_576..=1 << 50))]
     pub status_log_bytes: u64,
     /// Entries kept at most of each log of changes, some 1 KB each; older ones go before their 7 days are over, and none that a service has not read. The same for
     /// each process with role fleet.

@@ -155,14 +155,17 @@ impl FramesQueue {
 /// Rows that one slice makes coarser: a MiB or two of reading and writing.
 pub(crate) const COARSE_ROWS: i64 = 16;
 
+/// Whether a row goes for its age. What a wrong clock has stamped ahead of now is young enough to be kept.
+pub(crate) fn is_past_days(at_unix_ms: i64, now: Utc) -> bool {
+    now.ms_since(Utc(at_unix_ms)) >= DAYS_MS
+}
+
 /// Of the oldest rows ([`crate::sql::FRAME_SIZES`]), `kept` bytes in all, how many go for their age or for `bytes_max`: the position of the last one, and their
 /// bytes.
 pub(crate) fn surplus(rows: &[(i64, i64, i64)], kept: u64, bytes_max: u64, now: Utc) -> (i64, u64) {
     let (mut up_to, mut freed) = (0, 0);
     for (position, size, at_unix_ms) in rows {
-        // What a wrong clock has stamped ahead of now is young enough to be kept.
-        let is_old = now.ms_since(Utc(*at_unix_ms)) >= DAYS_MS;
-        if kept.saturating_sub(freed) <= bytes_max && !is_old {
+        if kept.saturating_sub(freed) <= bytes_max && !is_past_days(*at_unix_ms, now) {
             break;
         }
         up_to = *position;

@@ -93,8 +93,6 @@ impl TaskService {
         let go_on = |after: Option<&Cursor>| after.map(|c| token(print, c)).unwrap_or_default();
         while rows_read < limits::LIST_ROWS_READ_MAX {
             let rows = search.next(store).await.map_err(unavailable)?;
-            // The first read is enough for most pages.
-            search.grow();
             if rows.is_empty() {
                 return Ok(v1::ListTasksResponse {
                     tasks,
@@ -103,6 +101,9 @@ impl TaskService {
                 });
             }
             let found = read_many(store, &search.find_candidates(store, &rows).await.map_err(unavailable)?).await?;
+            if found.len() * 2 < rows.len() {
+                search.grow();
+            }
             let mut found: BTreeMap<_, _> = found.into_iter().map(|t| (t.intake.task_id.to_string(), t)).collect();
             for row in &rows {
                 rows_read += 1;

@@ -75,12 +75,12 @@ impl<'f> Search<'f> {
             // Live tasks are few; those that ended with a robot are found by the robot.
             let robots = filter.robot_ids.iter().map(|id| Arc::from(id.as_str()));
             Source::Robots(robots.map(OfRobot::new).collect())
-        } else if filter.phases.is_empty() && filter.robot_ids.is_empty() && filter.asks_intake() {
+        } else if filter.phases.is_empty() && filter.robot_ids.is_empty() && filter.has_intake_conditions() {
             Source::Intakes
         } else {
             Source::States(filter.phases.iter().map(|phase| phase.number()).collect())
         };
-        Self { filter, texts: texts_of(filter), source, direction, after, rows }
+        Self { filter, texts: collect_texts(filter), source, direction, after, rows }
     }
 
     /// The next rows; none: the walk is at its end.
@@ -104,7 +104,7 @@ impl<'f> Search<'f> {
         Ok(rows)
     }
 
-    /// Reads more at a time from now on.
+    /// Makes it read more at a time from now on: few of what it read were meant.
     pub fn grow(&mut self) {
         self.rows = (self.rows * GROWTH).min(limits::PAGE_MAX);
     }
@@ -119,31 +119,31 @@ impl<'f> Search<'f> {
         };
         let rows = rows.iter().filter(may);
         if matches!(self.source, Source::Intakes) {
-            return Ok(rows.filter(|row| self.may_admit(row)).filter_map(task_id).collect());
+            return Ok(rows.filter(|row| self.may_admit(row)).filter_map(parse_task_id).collect());
         }
         if self.texts.is_empty() {
-            return Ok(rows.filter_map(task_id).collect());
+            return Ok(rows.filter_map(parse_task_id).collect());
         }
         let intakes = store.get(rows.map(|row| Key::new(Table::TaskIntake, &row.key.id)).collect()).await?;
-        Ok(intakes.iter().filter(|row| self.may_admit(row)).filter_map(task_id).collect())
+        Ok(intakes.iter().filter(|row| self.may_admit(row)).filter_map(parse_task_id).collect())
     }
 
-    /// One that cannot be read is left to the caller, who says so.
+    /// An intake with these texts that cannot be read is left to the caller, who says so.
     fn may_admit(&self, intake: &Row) -> bool {
         self.texts.iter().all(|text| intake.body.contains(text.as_str()))
             && intake.decode::<TaskIntake>().map_or(true, |intake| self.filter.admits_intake(&intake))
     }
 }
 
-/// What the filter asks of an intake's texts, as JSON has them.
-fn texts_of(filter: &TaskFilter) -> Vec<String> {
+/// Collects what the filter asks of an intake's texts, as JSON has them.
+fn collect_texts(filter: &TaskFilter) -> Vec<String> {
     let kind = filter.kinds.first().filter(|_| filter.kinds.len() == 1);
     let reference = Some(&filter.external_ref).filter(|reference| !reference.is_empty());
     let texts = filter.labels.values().chain(kind).chain(reference);
     texts.filter_map(|text| serde_json::to_string(text).ok()).collect()
 }
 
-fn task_id(row: &Row) -> Option<TaskId> {
+fn parse_task_id(row: &Row) -> Option<TaskId> {
     TaskId::parse(&row.key.id).ok()
 }
 

@@ -17,7 +17,6 @@ use midshift_core::stop::{FOLDER, LOG};
 use midshift_core::time::{Clock, LinkTime};
 use midshift_process::clock;
 use midshift_stop::NotEnded;
-use midshift_stop::program::UP_WITHIN;
 use midshift_store::Store;
 use std::fs::{DirBuilder, File, OpenOptions};
 use std::future::pending;
@@ -37,6 +36,8 @@ use tonic_health::pb::health_client::HealthClient;
 
 /// How often it is looked whether one that was started answers: whoever starts a server waits for it.
 const ANSWER_EVERY: Duration = Duration::from_millis(5);
+/// One that lives and has not answered by then is not coming. Its disk may be slow: it answers once its files are on it.
+const ANSWERS_WITHIN: Duration = Duration::from_secs(60);
 /// How often one that runs is looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// One that has more than this begins anew, bytes.
@@ -103,10 +104,10 @@ impl Supervisor {
                     self.data.join(FOLDER).join(LOG).display()
                 );
             }
-            if begun.elapsed() >= UP_WITHIN {
+            if begun.elapsed() >= ANSWERS_WITHIN {
                 bail!(
                     "the stop service at {listen} did not answer within {} s, or one of another site has the port; --no-stop if it runs elsewhere, --stop-listen for another port",
-                    UP_WITHIN.as_secs()
+                    ANSWERS_WITHIN.as_secs()
                 );
             }
             sleep(ANSWER_EVERY).await;

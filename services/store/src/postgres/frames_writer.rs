@@ -5,7 +5,7 @@
 
 use super::connect::{Database, WRITE_PATIENCE, is_gone, is_undone_by_others, no_answer};
 use crate::frames::Marks;
-use crate::frames_queue::{COARSE_ROWS, FramesEngine, GAPS_KEPT, Packed, made_coarser, mark, surplus};
+use crate::frames_queue::{COARSE_ROWS, FramesEngine, GAPS_KEPT, Packed, is_past_days, made_coarser, mark};
 use crate::queue::unavailable;
 use crate::{Coarsen, Error, Frame, FrameMark, FramesOldest, Gap, OpenError, sql};
 use midshift_core::ids::SiteId;
@@ -26,6 +26,8 @@ pub(super) struct FramesWriter {
     site_id: SiteId,
     clock: Arc<dyn Clock>,
     bytes_max: u64,
+    /// Rows up to here go for their bytes in the slices of this pass; none: no pass is under way.
+    surplus_end: Option<i64>,
 }
 
 /// What one transaction does.
@@ -33,7 +35,7 @@ enum Work<'w> {
     Append { rows: &'w [Packed], marks: Vec<FrameMark>, at_unix_ms: i64 },
     Forget(&'w [FrameMark]),
     Gaps(&'w [Gap]),
-    Prune { bytes_max: u64, now: Utc },
+    Prune { surplus_end: i64, now: Utc },
     Coarsen { coarsen: Coarsen, now: Utc },
 }
 
@@ -52,7 +54,7 @@ impl FramesWriter {
         .execute(&mut connection)
         .await
         .map_err(|source| OpenError::Sql { doing: "reading the head of the frame log", source })?;
-        Ok(Self { database, connection: Some(connection), site_id, clock, bytes_max })
+        Ok(Self { database, connection: Some(connection), site_id, clock, bytes_max, surplus_end: None })
     }
 
     async fn connect(&mut self) -> Result<PgConnection, Error> {
@@ -117,7 +119,21 @@ impl FramesEngine for FramesWriter {
     }
 
     async fn prune(&mut self) -> Result<u64, Error> {
-        self.transaction(&Work::Prune { bytes_max: self.bytes_max, now: self.clock.now().steady_wall() }).await
+        // Outside the transaction, which every append waits for; a position, on which several processes agree.
+        let surplus_end = match self.surplus_end {
+            Some(end) => end,
+            None => {
+                let mut connection = self.connect().await?;
+                let read =
+                    tokio::time::timeout(WRITE_PATIENCE, surplus_end(&mut connection, &self.site_id, self.bytes_max));
+                let end = read.await.map_err(|_| Error::Unavailable(no_answer()))?.map_err(unavailable)?;
+                self.connection = Some(connection);
+                end
+            }
+        };
+        let freed = self.transaction(&Work::Prune { surplus_end, now: self.clock.now().steady_wall() }).await?;
+        self.surplus_end = (freed > 0).then_some(surplus_end);
+        Ok(freed)
     }
 
     async fn coarsen(&mut self, coarsen: Coarsen) -> Result<u64, Error> {
@@ -155,7 +171,7 @@ async fn once(connection: &mut PgConnection, site_id: &SiteId, work: &Work<'_>) 
             report(connection, site_id, gaps).await?;
             0
         }
-        Work::Prune { bytes_max, now } => prune(connection, site_id, *bytes_max, *now).await?,
+        Work::Prune { surplus_end, now } => prune(connection, site_id, *surplus_end, *now).await?,
         Work::Coarsen { coarsen, now } => make_coarser(connection, site_id, *coarsen, *now).await?,
     };
     sqlx::raw_sql("COMMIT").execute(connection).await?;
@@ -239,14 +255,33 @@ async fn report(connection: &mut PgConnection, site_id: &SiteId, gaps: &[Gap]) -
     sqlx::query(sql::GAPS_PRUNE).bind(site_id.as_str()).bind(kept).execute(connection).await.map(drop)
 }
 
-async fn prune(connection: &mut PgConnection, site_id: &SiteId, bytes_max: u64, now: Utc) -> Result<u64, sqlx::Error> {
-    let sum = sqlx::query("SELECT COALESCE(SUM(size), 0)::bigint FROM frame_log WHERE site_id = $1");
-    let sum: i64 = sum.bind(site_id.as_str()).fetch_one(&mut *connection).await?.try_get(0)?;
+/// The newest row that goes so that at most `bytes_max` stay; 0: none does.
+async fn surplus_end(connection: &mut PgConnection, site_id: &SiteId, bytes_max: u64) -> Result<i64, sqlx::Error> {
+    let end = sqlx::query(
+        "SELECT COALESCE(MAX(position), 0) FROM (SELECT position, SUM(size) OVER (ORDER BY position DESC) AS kept \
+         FROM frame_log WHERE site_id = $1) AS summed WHERE kept > $2",
+    );
+    let bytes_max = i64::try_from(bytes_max).unwrap_or(i64::MAX);
+    end.bind(site_id.as_str()).bind(bytes_max).fetch_one(connection).await?.try_get(0)
+}
+
+async fn prune(
+    connection: &mut PgConnection,
+    site_id: &SiteId,
+    surplus_end: i64,
+    now: Utc,
+) -> Result<u64, sqlx::Error> {
     let oldest = sqlx::query(sql::FRAME_SIZES).bind(site_id.as_str()).bind(0i64).bind(PRUNE_ROWS);
     let rows = oldest.fetch_all(&mut *connection).await?;
-    let sizes = rows.iter().map(|row| Ok((row.try_get(0)?, row.try_get(1)?, row.try_get(2)?)));
-    let sizes = sizes.collect::<Result<Vec<_>, sqlx::Error>>()?;
-    let (up_to, freed) = surplus(&sizes, sum.cast_unsigned(), bytes_max, now);
+    let (mut up_to, mut freed) = (0, 0);
+    for row in &rows {
+        let (position, size, at_unix_ms): (i64, i64, i64) = (row.try_get(0)?, row.try_get(1)?, row.try_get(2)?);
+        if position > surplus_end && !is_past_days(at_unix_ms, now) {
+            break;
+        }
+        up_to = position;
+        freed += size.cast_unsigned();
+    }
     let delete = sqlx::query("DELETE FROM frame_log WHERE site_id = $1 AND position <= $2");
     delete.bind(site_id.as_str()).bind(up_to).execute(connection).await?;
     Ok(freed)

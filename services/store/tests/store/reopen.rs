@@ -139,6 +139,12 @@ async fn frames_on_postgresql_keep_the_contract_for_every_process_that_has_them_
     assert!(log.prune().await.unwrap() > 200_000);
     assert_eq!(other.prune().await.unwrap(), 0);
     assert_eq!(log.read(0, usize::MAX).await.unwrap().len(), 2);
+    for _ in 0..5 {
+        other.append(vec![frame("c", 1, 1, 100_000)]).await.unwrap();
+    }
+    let (one, two) = tokio::join!(log.prune(), other.prune());
+    assert!(one.unwrap() + two.unwrap() > 200_000);
+    assert_eq!(log.read(0, usize::MAX).await.unwrap().len(), 2, "two that prune at once take no more than one");
     assert_eq!(marks(&open().await).await, [("a".to_owned(), 5), ("b".to_owned(), 12), ("c".to_owned(), 1)]);
     let nul = Frame { ring: Arc::from("r\0"), ..frame("a", 6, 6, 1) };
     assert!(matches!(log.append(vec![nul]).await, Err(Error::BadFrame(_))));
