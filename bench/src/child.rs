@@ -2,7 +2,7 @@
 //!
 //! Invariant: a child lives no longer than its parent: it ends when its stdin does. Called by every measurement.
 
-use crate::usage::Memory;
+use crate::process_files::Memory;
 use anyhow::{Context, bail, ensure};
 use std::io::{BufRead, BufReader, Write};
 use std::net::SocketAddr;

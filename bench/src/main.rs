@@ -11,16 +11,12 @@ mod grid_map;
 mod link;
 mod listen;
 mod offer;
-#[expect(clippy::expect_used, reason = "shared with the tests, which fail by panicking")]
-#[expect(dead_code, reason = "shared with the tests, which commit old sites whole too")]
-#[path = "../../tests/src/old_site.rs"]
-mod old_site;
+mod old_sites;
 mod old_store;
-#[path = "../../tests/src/old_tables.rs"]
-mod old_tables;
 mod ota;
 mod outcome;
 mod plan;
+mod process_files;
 mod questions;
 mod reads;
 mod robot;

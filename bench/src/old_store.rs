@@ -8,8 +8,8 @@ use crate::engine::{Bed, Engine, EngineArgs};
 use crate::figure::{Figure, percentile};
 use crate::grid_map;
 use crate::offer::{Idle, one};
-use crate::old_site::OldSite;
-use crate::old_tables;
+use crate::old_sites::old_site::OldSite;
+use crate::old_sites::old_tables;
 use crate::submit::transports;
 use anyhow::{Context, ensure};
 use midshift_agent::clock::wall;
@@ -84,8 +84,8 @@ fn figures_of(args: &OldArgs, engine: &Engine, ended: u64, rounds: &Rounds, empt
     let of_server =
         |what: &str, unit, of: fn(&Rounds) -> &Vec<f64>| Figure::new("P6", name(what), unit, of(rounds), beside(of));
     let mut figures = vec![
-        of_server("start to ready", "ms", |r| &r.ready_ms),
-        of_server("ready to a robot's first offer", "ms", |r| &r.offer_ms),
+        of_server("start to a port that listens", "ms", |r| &r.ready_ms),
+        of_server("from there to a robot's first offer", "ms", |r| &r.offer_ms),
         of_server("memory after it", "MiB", |r| &r.rss_mib),
     ];
     if !rounds.takeover_ms.is_empty() {

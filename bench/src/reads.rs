@@ -4,8 +4,8 @@
 use crate::child::Child;
 use crate::engine::{Bed, Engine, EngineArgs};
 use crate::figure::{Figure, percentile};
-use crate::old_site::OldSite;
-use crate::old_tables;
+use crate::old_sites::old_site::OldSite;
+use crate::old_sites::old_tables;
 use anyhow::{Context, ensure};
 use midshift_agent::clock::wall;
 use midshift_core::site::{DEMO, text};

@@ -1,7 +1,7 @@
 //! What a server has spent so far, by the kernel's books and its own.
 
 use crate::child::Child;
-use anyhow::Context;
+use crate::process_files::find_field;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -40,12 +40,13 @@ impl Usage {
             let thread = thread?;
             // One that ended meanwhile counts for nothing.
             let Ok(status) = std::fs::read_to_string(thread.path().join("status")) else { continue };
-            let count = field(&status, "voluntary_ctxt_switches:")? + field(&status, "nonvoluntary_ctxt_switches:")?;
+            let count =
+                find_field(&status, "voluntary_ctxt_switches:")? + find_field(&status, "nonvoluntary_ctxt_switches:")?;
             switches.insert(thread.file_name().to_string_lossy().into_owned(), count);
         }
         let io = std::fs::read_to_string(process.join("io"))?;
         let groups = server.ask(GROUPS)? as f64;
-        Ok(Self { cpu_s: server.cpu_s()?, switches, written_bytes: field(&io, "write_bytes:")?, groups })
+        Ok(Self { cpu_s: server.cpu_s()?, switches, written_bytes: find_field(&io, "write_bytes:")?, groups })
     }
 
     /// What was spent from `then` until this, each second.
@@ -57,29 +58,5 @@ impl Usage {
             written_bytes: (self.written_bytes - then.written_bytes) / seconds,
             groups: (self.groups - then.groups) / seconds,
         }
-    }
-}
-
-/// The number behind a name at the beginning of a line.
-fn field(text: &str, name: &str) -> anyhow::Result<f64> {
-    let number = text.lines().find_map(|line| line.strip_prefix(name));
-    number.and_then(|n| n.trim().trim_end_matches(" kB").parse().ok()).with_context(|| format!("no {name} in /proc"))
-}
-
-/// What a process has in memory now.
-#[derive(Clone, Copy, Debug)]
-pub struct Memory {
-    /// Its own (RssAnon), MiB.
-    pub own_mib: f64,
-    /// With pages of files, the program's too, that others may share (VmRSS), MiB.
-    pub all_mib: f64,
-}
-
-impl Memory {
-    /// Reads it of a process.
-    pub fn read(pid: u32) -> anyhow::Result<Self> {
-        let status = std::fs::read_to_string(format!("/proc/{pid}/status"))?;
-        let mib = |name: &str| anyhow::Ok(field(&status, name)? / 1_024.0);
-        Ok(Self { own_mib: mib("RssAnon:")?, all_mib: mib("VmRSS:")? })
     }
 }
