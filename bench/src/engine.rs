@@ -167,6 +167,15 @@ impl Bed<'_> {
     pub async fn serve(&self, site: Option<&Path>, core: Option<usize>) -> anyhow::Result<Child> {
         Child::serve(&self.dir.path().join("data"), site, self.url(), core).await
     }
+    /// Bytes of the database, if it is not files in the server's directory; else 0.
+    pub async fn database_bytes(&self) -> anyhow::Result<u64> {
+        let Some(url) = self.url() else { return Ok(0) };
+        let mut connection = PgConnection::connect(url).await?;
+        let bytes: i64 =
+            sqlx::query_scalar("SELECT pg_database_size(current_database())").fetch_one(&mut connection).await?;
+        connection.close().await?;
+        Ok(bytes.cast_unsigned())
+    }
     /// The raw limit here.
     pub async fn baseline(&self) -> anyhow::Result<DurableBaseline> {
         let Some(url) = self.url() else { return Ok(DurableBaseline::Disk(Disk::beside(self.dir.path())?)) };

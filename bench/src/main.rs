@@ -24,6 +24,7 @@ mod roles;
 mod saturation;
 mod session_baseline;
 mod simulators;
+mod soak;
 mod start;
 mod stop;
 mod submit;
@@ -55,6 +56,8 @@ enum Name {
     Start(start::StartArgs),
     /// What calls cost that only read, at a site where thousands of tasks are over.
     Reads(reads::ReadsArgs),
+    /// A long run of a site at work: whether memory, times and files stay, and nothing is lost.
+    Soak(soak::SoakArgs),
     /// How often the gates of a roll-out are right and wrong, simulated from a seed.
     Gates(gates::GatesArgs),
     /// Software of robots: directives, ten thousand robots assigned, the way back; a download at line rate, patches, downloads that are cut off.
@@ -94,6 +97,7 @@ fn main() -> anyhow::Result<()> {
         Name::Link(args) => wait(link::run(args, &note))?,
         Name::Start(args) => wait(start::run(args, &note))?,
         Name::Reads(args) => wait(reads::run(args, &note))?,
+        Name::Soak(args) => wait(soak::run(args, &note))?,
         Name::Gates(args) => gates::run(args)?,
         Name::Ota(args) => {
             let outcome = wait(async { Ok(ota::run(args, &note).await) })?;

@@ -122,10 +122,6 @@ impl Drop for Running {
         }
         let _ = self.server.wait();
         let _ = midshift_stop::end_holder(&self.stop_folder);
-        let end = Instant::now() + GONE_WITHIN;
-        while midshift_stop::is_held(&self.stop_folder) && Instant::now() < end {
-            std::thread::sleep(ASK_EVERY);
-        }
     }
 }
 
@@ -147,6 +143,13 @@ async fn start(args: &StartArgs, data: &Path, starts: &mut Starts) -> anyhow::Re
     starts.server.push(Memory::read(server)?);
     for stop_service in children_of(server)? {
         starts.stop_service.push(Memory::read(stop_service)?);
+    }
+    let stop_folder = running.stop_folder.clone();
+    drop(running);
+    // The next start may be on the same folder.
+    let end = Instant::now() + GONE_WITHIN;
+    while midshift_stop::is_held(&stop_folder) && Instant::now() < end {
+        sleep(ASK_EVERY).await;
     }
     Ok(())
 }

@@ -13,9 +13,9 @@ mod netns;
 pub mod noise;
 pub mod parts;
 mod programs;
-mod release;
+pub mod release;
 mod resume;
-mod server;
+pub mod server;
 
 pub use args::OtaArgs;
 

@@ -6,8 +6,8 @@
 mod assign;
 mod back;
 mod cut;
-mod rollouts;
-mod scene;
+pub mod rollouts;
+pub mod scene;
 mod sign;
 mod trace;
 

@@ -54,12 +54,21 @@ impl Floor {
     fn path(&self, name: &str) -> anyhow::Result<String> {
         Ok(self.dir.path().join(name).to_str().context("a path that is no text")?.to_owned())
     }
+    /// The directory of the server.
+    pub fn data(&self) -> PathBuf {
+        self.dir.path().join("data")
+    }
     /// Starts the server on the first core, once it listens.
     pub async fn serve(&self) -> anyhow::Result<Child> {
+        self.serve_on(None).await
+    }
+    /// The same, with its rows in a `store`.
+    pub async fn serve_on(&self, store: Option<&str>) -> anyhow::Result<Child> {
         let (data, listen) = (self.path("data")?, self.address.to_string());
         let map = self.map.to_str().context("a path that is no text")?;
         let keys = self.people.keys.to_str().context("a path that is no text")?;
-        let role = ["serve", "--data", &data, "--site", map, "--listen", &listen, "--ota-keys", keys];
+        let mut role = vec!["serve", "--data", &data, "--site", map, "--listen", &listen, "--ota-keys", keys];
+        role.extend(store.iter().flat_map(|url| ["--store", url]));
         Child::start(&role, Some(0))?.listening().await
     }
     /// Starts robots that hear, on the other cores.
