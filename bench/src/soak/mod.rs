@@ -84,7 +84,7 @@ async fn soak(args: &SoakArgs, engine: &Engine, bed: &Bed<'_>, say: &dyn Fn(&str
             _ = look.tick() => {
                 let open = server.ask(OPEN)?;
                 ensure!(open <= OPEN_PER_ROBOT * args.robots as u64, "{open} tasks are open: ask for a lower --rate");
-                let sample = Sample::take(&server, bed, &floor, begun.elapsed(), submitted.take_times()).await?;
+                let sample = Sample::look_at(&server, bed, &floor, begun.elapsed(), submitted.take_times()).await?;
                 say(&format!("{sample}, {open} tasks open{}", engine.suffix()));
                 samples.push(sample);
             }
@@ -99,7 +99,7 @@ async fn soak(args: &SoakArgs, engine: &Engine, bed: &Bed<'_>, say: &dyn Fn(&str
 }
 
 fn figures_of(engine: &Engine, run: &Run) -> Vec<Figure> {
-    let thirds = Thirds::of(&run.samples);
+    let thirds = Thirds::cut_run(&run.samples);
     let name = |what: &str| format!("{what}, last third{}", engine.suffix());
     let beside = |what: &str, unit, of: &dyn Fn(&[Sample]) -> Vec<f64>| {
         let (second, last) = (of(thirds.second), of(thirds.last));

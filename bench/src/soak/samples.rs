@@ -23,7 +23,7 @@ pub struct Sample {
 
 impl Sample {
     /// Looks at a server and its files.
-    pub async fn take(
+    pub async fn look_at(
         server: &Child,
         bed: &Bed<'_>,
         floor: &Floor,
@@ -63,7 +63,7 @@ pub struct Thirds<'s> {
 
 impl<'s> Thirds<'s> {
     /// Cuts a run.
-    pub fn of(samples: &'s [Sample]) -> Self {
+    pub fn cut_run(samples: &'s [Sample]) -> Self {
         let third = samples.len() / 3;
         let (rest, last) = samples.split_at(samples.len() - third);
         Self { second: &rest[rest.len() - third..], last }
@@ -96,7 +96,7 @@ mod tests {
     #[test]
     fn the_last_third_stands_beside_the_one_before_it_and_the_rest_warms_up() {
         let samples: Vec<Sample> = (0..8).map(|minute| sample(minute, minute * 2_000_000, &[1.0, 3.0])).collect();
-        let thirds = Thirds::of(&samples);
+        let thirds = Thirds::cut_run(&samples);
         let minutes = |samples: &[Sample]| samples.iter().map(|s| s.own_mib).collect::<Vec<_>>();
         assert_eq!((minutes(thirds.second), minutes(thirds.last)), (vec![4.0, 5.0], vec![6.0, 7.0]));
         assert!((growth_mb_a_minute(thirds.last) - 2.0).abs() < 1e-9);
