@@ -533,11 +533,19 @@ pub const CONNECTION_LAST: LinkDuration = LinkDuration::from_secs(1);
 pub const DENIED_LAST: LinkDuration = LinkDuration::from_secs(3);
 /// A robot that hears that its key was taken out dials again after so long: nothing but a person changes that.
 pub const REVOKED_RETRY: LinkDuration = LinkDuration::from_secs(60);
-/// Hellos of robots that one process carries out at a time; each is a write, and writes of so many are one or two groups. Further ones are told when to
-/// come again, so that a storm of ten thousand is over in seconds and none of them waits until it gives up.
+/// Hellos of robots that one process carries out at a time; each is a write, and writes of so many are one or two groups.
 pub const HELLOS_MAX: usize = 512;
-/// A robot whose Hello found no room comes again after a time drawn evenly from this and as much again.
+/// Further Hellos that wait on their streams: what a core takes in half of [`HELLO_WAITS`]. The rest are told when to come again, so that a storm of ten
+/// thousand is over in seconds.
+pub const HELLOS_WAITING_MAX: usize = 2_048;
+/// A Hello waits for room no longer than that, half of what a robot waits for its welcome.
+pub const HELLO_WAITS: LinkDuration = LinkDuration::from_secs(5);
+/// A robot whose Hello found no room comes again after this at the earliest ..
 pub const HELLO_AGAIN: LinkDuration = LinkDuration::from_secs(1);
+/// .. and after this at the latest; the protocol promises robots that nobody is sent away for longer.
+pub const HELLO_AGAIN_MAX: LinkDuration = LinkDuration::from_secs(10);
+/// The next one so much after the one before: what a Hello costs a core, with its handshake.
+pub const HELLO_STEP: LinkDuration = LinkDuration(2);
 /// One caller that is denied again and again leaves a row in the audit so often; what lies between is counted in the next row.
 pub const DENIALS_EVERY: LinkDuration = LinkDuration::from_secs(60);
 /// Rows of one caller at once.

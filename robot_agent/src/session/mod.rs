@@ -91,7 +91,7 @@ pub enum Error {
 /// charge.
 const OBSERVED_SILENCE_MAX: LinkDuration = LinkDuration::from_secs(60);
 /// Shortest and longest pause between attempts to connect, real time.
-const RETRY: std::ops::Range<Duration> = Duration::from_millis(200)..Duration::from_secs(10);
+const RETRY: std::ops::RangeInclusive<Duration> = Duration::from_millis(200)..=Duration::from_secs(10);
 /// A server that moves its robots over or restarts is asked again within this, milliseconds of real time.
 const SOON_MS: std::ops::Range<u64> = 50..1_000;
 /// The store comes back from each commit.
@@ -137,6 +137,8 @@ pub struct Agent {
     open: Option<Open>,
     connect_state: ConnectState,
     retry: ExponentialBackoff,
+    /// The least pauses where the server says when to come again.
+    sent_away: ExponentialBackoff,
     /// How long the next session may be silent if it is only observed.
     patience: LinkDuration,
     /// Why there is no session, as the log was told.
@@ -188,6 +190,7 @@ pub fn run(
         }
         let agent = Agent {
             retry: retries(config.seed),
+            sent_away: retries(config.seed),
             patience: SILENCE,
             refused: Repeats::default(),
             rng: rand::rngs::StdRng::seed_from_u64(config.seed),
@@ -220,10 +223,11 @@ async fn look_at_disk(updates: Option<&mut Updates>) -> Option<Holdings> {
     }
 }
 
+/// Jitter makes each pause up to twice as long.
 fn retries(seed: u64) -> ExponentialBackoff {
     ExponentialBuilder::default()
-        .with_min_delay(RETRY.start)
-        .with_max_delay(RETRY.end)
+        .with_min_delay(*RETRY.start())
+        .with_max_delay(*RETRY.end() / 2)
         .with_factor(2.0)
         .without_max_times()
         .with_jitter()
@@ -410,7 +414,7 @@ impl Agent {
     }
 
     fn wait_to_dial(&mut self, at_least: Option<Duration>) {
-        let pause = at_least.or_else(|| self.retry.next()).unwrap_or(RETRY.end);
+        let pause = at_least.or_else(|| self.retry.next()).unwrap_or(*RETRY.end());
         self.connect_state = ConnectState::Waiting(Box::pin(tokio::time::sleep(pause)));
     }
 
@@ -471,6 +475,7 @@ impl Agent {
                 self.refused.forget();
                 self.open = Some(open);
                 self.retry = retries(self.rng.random());
+                self.sent_away = retries(self.rng.random());
                 self.step(Input::Connected(welcome));
             }
             Greeted::Closed(close) => self.closed(&close),
@@ -491,10 +496,13 @@ impl Agent {
 
     fn greeting_failed(&mut self, why: &str, again_after: Option<Duration>) {
         self.log_refusal(why);
-        // As the server asks, and apart from others that it asked the same; a server cannot send it away for long.
-        let asked = again_after.map(|after| after.min(RETRY.end) + self.soon());
-        let own = self.retry.next().unwrap_or(RETRY.end);
-        self.wait_to_dial(Some(asked.map_or(own, |asked| asked.max(own))));
+        // As the server asks, and apart from others that it asked the same; a server cannot send it away for long. One that asks again and again is asked
+        // less often.
+        let asked = again_after.map(|after| {
+            let own = self.sent_away.next().unwrap_or(*RETRY.end());
+            (after.min(*RETRY.end()) + self.soon()).max(own)
+        });
+        self.wait_to_dial(asked);
     }
 
     fn heard(&mut self, message: Option<Box<v1::SessionResponse>>) {

@@ -342,6 +342,42 @@ async fn a_server_that_is_overloaded_is_asked_again_when_it_says_and_not_sooner(
     bench.end().await;
 }
 
+/// Sends the robot away, so many times, and tells how long it was away the last time.
+async fn is_away(bench: &mut Bench, session: &mut Seen, again_after: Option<LinkDuration>, times: usize) -> Duration {
+    let mut away = Duration::ZERO;
+    for _ in 0..times {
+        session.hello().await;
+        let overloaded = Refusal::new(Kind::Exhausted, Code::Overloaded);
+        let asked = again_after.map(|after| midshift_proto::status(&overloaded.again_after(after), None));
+        let status = asked.unwrap_or_else(|| Status::unavailable("no server here"));
+        session.down.send(Err(status)).await.expect("the robot listens");
+        let begin = tokio::time::Instant::now();
+        *session = bench.session().await;
+        away = begin.elapsed();
+    }
+    away
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_a_robot_waited_while_nobody_said_when_to_come_does_not_keep_it_from_its_turn() {
+    let mut bench = Bench::new(Box::new(MemoryStore::new()));
+    let mut session = bench.session().await;
+    let unasked = is_away(&mut bench, &mut session, None, 9).await;
+    assert!((Duration::from_secs(5)..=Duration::from_secs(10)).contains(&unasked), "{unasked:?}");
+    let asked = is_away(&mut bench, &mut session, Some(LinkDuration::from_secs(1)), 1).await;
+    assert!((Duration::from_secs(1)..Duration::from_millis(2_100)).contains(&asked), "{asked:?}");
+    bench.end().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_server_that_sends_a_robot_away_again_and_again_is_asked_less_and_less_often() {
+    let mut bench = Bench::new(Box::new(MemoryStore::new()));
+    let mut session = bench.session().await;
+    let asked = is_away(&mut bench, &mut session, Some(LinkDuration(1)), 9).await;
+    assert!((Duration::from_secs(5)..=Duration::from_secs(10)).contains(&asked), "{asked:?}");
+    bench.end().await;
+}
+
 #[tokio::test(start_paused = true)]
 async fn asked_to_move_over_it_opens_the_next_session_before_the_old_one_closes() {
     let mut bench = Bench::new(Box::new(MemoryStore::new()));

@@ -4,7 +4,7 @@
 
 use crate::Snapshot;
 use midshift_core::rows::{Key, Naming, Row, RowSelection, Seq, Table};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 /// What was read so far.
@@ -46,16 +46,12 @@ impl Gathered {
     }
 
     /// What rows named that were read since the last call, and that nobody has read; empty: there is no more.
-    pub(crate) fn missing(&mut self) -> BTreeMap<Table, Vec<Arc<str>>> {
-        let mut missing: BTreeMap<Table, BTreeSet<Arc<str>>> = BTreeMap::new();
+    pub(crate) fn missing(&mut self) -> Vec<Key> {
         let wanted = std::mem::take(&mut self.wanted);
-        for key in wanted.into_iter().chain((self.named)(&self.rows[self.asked..])) {
-            if !self.known.contains(&key) {
-                missing.entry(key.table).or_default().insert(key.id);
-            }
-        }
+        let named = wanted.into_iter().chain((self.named)(&self.rows[self.asked..]));
+        let missing = named.filter(|key| !self.known.contains(key)).collect();
         self.asked = self.rows.len();
-        missing.into_iter().map(|(table, ids)| (table, ids.into_iter().collect())).collect()
+        missing
     }
 
     /// Tables and parents of which rows are to be read, for rows that were read since the last call.

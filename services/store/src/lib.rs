@@ -52,5 +52,5 @@ pub use skipped_rows::SkippedRows;
 pub use sqlite::{Database, Described, SqliteFrames, SqliteRestored, SqliteStore, migrate, renew_identity};
 pub use store::{
     Applied, Cause, CommitError, Cursor, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, ID_BYTES_MAX, Query, Retention,
-    SEQ_PLAUSIBLE_MAX, Snapshot, Store, StoreId, Subjects, follow, load,
+    SEQ_PLAUSIBLE_MAX, Snapshot, Store, StoreId, Subjects, find_record, follow, load,
 };

@@ -217,10 +217,8 @@ impl Store for MemoryStore {
             if missing.is_empty() && is_whole {
                 return Ok(gathered.at(state.head));
             }
-            for (table, ids) in missing {
-                let rows = ids.iter().filter_map(|id| state.tables.get(&table)?.get(id));
-                gathered.add(rows.cloned());
-            }
+            let rows = missing.iter().filter_map(|key| state.tables.get(&key.table)?.get(&key.id));
+            gathered.add(rows.cloned());
         }
     }
 

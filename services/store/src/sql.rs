@@ -6,6 +6,7 @@
 use crate::{Cursor, Query};
 use midshift_core::rows::{Entry, Index, Key, Log, Revision, Row, Seq, Table};
 use sqlx::{ColumnIndex, Decode, Type};
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// Columns of a row, as written.
@@ -80,6 +81,36 @@ pub(crate) fn in_state(table: Table) -> String {
 /// Rows of a table whose parent is `$2`.
 pub(crate) fn of_parent(table: Table) -> String {
     format!("SELECT {ROW_READ} FROM {} WHERE site_id = $1 AND parent = $2 ORDER BY ord, id", table.name())
+}
+
+/// The ids of keys by table, without what no engine can hold.
+pub(crate) fn ids_by_table<'k>(keys: impl IntoIterator<Item = &'k Key>) -> BTreeMap<Table, BTreeSet<&'k str>> {
+    let mut ids: BTreeMap<Table, BTreeSet<&str>> = BTreeMap::new();
+    for key in keys.into_iter().filter(|key| is_text(&key.id)) {
+        ids.entry(key.table).or_default().insert(&key.id);
+    }
+    ids
+}
+
+/// Rows of several tables by their ids, in one statement and so of one moment; the name of its table is behind each. Binds in order: site, then
+/// the ids of each table, which `are` compares with bind `n`.
+pub(crate) fn by_ids(tables: impl IntoIterator<Item = Table>, are: impl Fn(usize) -> String) -> String {
+    let select = |(bound, table): (usize, Table)| {
+        let name = table.name();
+        format!("SELECT {ROW_READ}, '{name}' AS tbl FROM {name} WHERE site_id = $1 AND id {}", are(bound))
+    };
+    (2..).zip(tables).map(select).collect::<Vec<_>>().join(" UNION ALL ")
+}
+
+/// The rows of `keys` that were found, in the order of `keys`.
+pub(crate) fn in_order(keys: &[Key], rows: Vec<Row>) -> Vec<Row> {
+    let found: BTreeMap<Key, Row> = rows.into_iter().map(|row| (row.key.clone(), row)).collect();
+    keys.iter().filter_map(|key| found.get(key).cloned()).collect()
+}
+
+/// Whether every engine can be asked about it: no row has a NUL in its id.
+pub(crate) fn is_text(text: &str) -> bool {
+    !text.as_bytes().contains(&0)
 }
 
 /// What is asked of an entry beside its subject: in words, so that the index of such entries alone is used.
@@ -184,6 +215,23 @@ where
     })
 }
 
+/// One row of what [`by_ids`] asks.
+pub(crate) fn row_of_any<'r, R>(found: &'r R) -> Result<Row, sqlx::Error>
+where
+    R: sqlx::Row,
+    usize: ColumnIndex<R>,
+    &'r str: Decode<'r, R::Database> + Type<R::Database>,
+    i64: Decode<'r, R::Database> + Type<R::Database>,
+{
+    let name: &str = found.try_get(6)?;
+    let table = table_named(name).ok_or_else(|| sqlx::Error::ColumnNotFound(name.to_owned()))?;
+    row(table, found)
+}
+
+fn table_named(name: &str) -> Option<Table> {
+    Table::ALL.iter().copied().find(|table| table.name() == name)
+}
+
 /// What an entry is called whose table this version does not know: nobody asks for that.
 const OF_NEWER_VERSION: &str = "of_newer_version";
 
@@ -198,7 +246,7 @@ where
 {
     let text = |column: usize| Ok::<_, sqlx::Error>(row.try_get::<Option<&str>, _>(column)?.map(Arc::from));
     let name = row.try_get::<Option<&str>, _>(1)?;
-    let table = name.and_then(|name| Table::ALL.iter().copied().find(|table| table.name() == name));
+    let table = name.and_then(table_named);
     let is_newer = name.is_some() && table.is_none();
     Ok(Entry {
         seq: seq(row, 0)?,

@@ -350,10 +350,16 @@ pub(crate) fn page_of(mut entries: Vec<Entry>, limit: usize, head: Seq) -> FeedP
 /// # Errors
 /// As [`Store::get`]; [`Error::BadRow`] if the row does not decode.
 pub async fn load<R: Record>(store: &dyn Store, id: &str) -> Result<Option<(R, Revision)>, Error> {
-    match store.get(vec![Key::new(R::TABLE, id)]).await?.first() {
-        Some(row) => Ok(Some((row.decode()?, row.revision))),
-        None => Ok(None),
-    }
+    Ok(find_record(&store.get(vec![Key::new(R::TABLE, id)]).await?)?)
+}
+
+/// The first record of its kind among rows that were read together, with its revision.
+///
+/// # Errors
+/// The row does not decode.
+pub fn find_record<R: Record>(rows: &[Row]) -> Result<Option<(R, Revision)>, BadRow> {
+    let row = rows.iter().find(|row| row.key.table == R::TABLE);
+    row.map(|row| Ok((row.decode()?, row.revision))).transpose()
 }
 
 /// Hands over what `logs` hold after `cursor`, page by page to their head, and moves the cursor with each page. A cursor that never read

@@ -30,15 +30,12 @@ pub enum Enrolment {
 }
 
 impl Enrolment {
-    /// Of whoever asks to be this robot.
-    ///
-    /// # Errors
-    /// The store does not answer.
-    pub async fn read(inner: &Inner, robot_id: &RobotId, by: &Caller) -> Result<Self, Error> {
-        let Some(key) = by.key() else { return Ok(Self::None) };
-        let robot = enrolled(inner, robot_id).await?.filter(|robot| robot.has_key(key));
+    /// Of whoever asks to be this robot. `robot`: what the rows know of it.
+    pub fn judge(robot: Option<RobotIdentity>, robot_id: &RobotId, by: &Caller) -> Self {
+        let Some(key) = by.key() else { return Self::None };
         let unknown = || NotEnrolled { robot_id: robot_id.clone(), certificate: by.certificate().cloned(), key: *key };
-        Ok(robot.map_or_else(|| Self::Unknown(unknown()), |robot| Self::Own(Box::new(robot))))
+        let robot = robot.filter(|robot| robot.has_key(key));
+        robot.map_or_else(|| Self::Unknown(unknown()), |robot| Self::Own(Box::new(robot)))
     }
 
     /// The robot, where its machine is known.

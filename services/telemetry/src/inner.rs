@@ -3,6 +3,7 @@
 use crate::beacons::BeaconListener;
 use crate::bugs::Bugs;
 use crate::event_rate::EventRates;
+use crate::hellos::Hellos;
 use crate::misreads::Misreads;
 use crate::projection::LinkProjection;
 use crate::registry::Registry;
@@ -12,7 +13,6 @@ use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::time::Clock;
 use midshift_store::{FrameLog, HeartbeatLog, LiveBoard, Store};
 use std::sync::Arc;
-use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 
 /// What the service is built from.
@@ -43,7 +43,7 @@ pub(crate) struct Inner {
     pub shared: Option<Shared>,
     pub status_writer: StatusWriter,
     /// Room for robots that say hello.
-    pub hellos: Arc<Semaphore>,
+    pub hellos: Hellos,
     /// Robots are asked to go to another gateway, and no new one is taken.
     pub moving: CancellationToken,
     pub shutdown: CancellationToken,

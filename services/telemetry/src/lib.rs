@@ -11,6 +11,7 @@ mod event_rate;
 mod events;
 mod facts;
 mod grpc;
+mod hellos;
 mod inner;
 mod link;
 mod misreads;
@@ -47,7 +48,7 @@ use projection::LinkProjection;
 use registry::Registry;
 use status_writer::StatusWriter;
 use std::sync::Arc;
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding;
 use tonic::service::Routes;
@@ -64,7 +65,7 @@ impl TelemetryService {
         let (projection, registry, beacons) =
             (LinkProjection::default(), Registry::default(), beacons::BeaconListener::default());
         let shared = parts.heard.clone().map(shared_heartbeats::Shared::new);
-        let hellos = Arc::new(Semaphore::new(limits::HELLOS_MAX));
+        let hellos = hellos::Hellos::default();
         let (event_rates, moving) = (event_rate::EventRates::default(), CancellationToken::new());
         let misreads = misreads::Misreads::default();
         let status_writer = StatusWriter::default();

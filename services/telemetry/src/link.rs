@@ -5,9 +5,8 @@ use crate::session::{self, Down, Word, word};
 use crate::{TelemetryService, welcome};
 use midshift_core::identity::Caller;
 use midshift_core::ids::RobotId;
-use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
-use midshift_core::time::{LinkDuration, Utc};
+use midshift_core::time::Utc;
 use midshift_proto::access::caller;
 use midshift_proto::link::v1::{self, link_service_server::LinkService};
 use midshift_proto::session::{FromRobot, Hello, ToRobot};
@@ -84,11 +83,10 @@ impl TelemetryService {
         // Before anything is asked about that robot, or done to a session of it.
         by.is_robot(&hello.robot_id)?;
         welcome::check(&self.inner, &hello)?;
+        let room = self.inner.hellos.enter(self.inner.projection.ready()).await?;
         if self.inner.moving.is_cancelled() {
             return Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown));
         }
-        let room = self.inner.hellos.clone().try_acquire_owned().map_err(|_| crowded(rand::random()))?;
-        self.inner.projection.ready().await;
         // Elsewhere: its state is no session's once it is over.
         let begun = Box::pin(welcome::begin(&self.inner, &hello, by)).await?;
         drop(room);
@@ -108,16 +106,6 @@ impl TelemetryService {
         tracing::info!(peer = Empty, %robot_id, session_epoch = epoch, "session ended");
         Ok(())
     }
-}
-
-/// Too many come at once. `draw` is even over all of `u32`: those who are told so together do not come again together.
-fn crowded(draw: u32) -> Refusal {
-    let least_ms = limits::HELLO_AGAIN.as_ms();
-    let spread_ms = u128::from(least_ms) * u128::from(draw) / u128::from(u32::MAX);
-    let again_after = LinkDuration(least_ms + u64::try_from(spread_ms).unwrap_or(least_ms));
-    metrics::counter!("midshift_telemetry_hellos_put_off_total").increment(1);
-    let text = format!("{} robots are saying hello", limits::HELLOS_MAX);
-    Refusal::new(Kind::Exhausted, Reason::new(Code::Overloaded, text)).again_after(again_after)
 }
 
 struct Leave<'a> {
@@ -167,17 +155,5 @@ fn read(first: v1::SessionRequest) -> Result<Hello, Refusal> {
     match midshift_proto::parse(first)? {
         FromRobot::Hello(hello) => Ok(*hello),
         FromRobot::Uplink(_) => Err(Refusal::field("message", "the first message must be a hello")),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn robots_that_are_put_off_together_do_not_come_again_together() {
-        let least = limits::HELLO_AGAIN.as_ms();
-        let after = |draw| crowded(draw).again_after.map(LinkDuration::as_ms);
-        assert_eq!([0, u32::MAX / 2, u32::MAX].map(after), [Some(least), Some(least + least / 2 - 1), Some(2 * least)]);
     }
 }

@@ -5,16 +5,16 @@ use crate::enrolment::{Enrolment, Waits, accepts, known_device_key};
 use crate::inner::Inner;
 use crate::registry::{InCharge, Replay};
 use midshift_bundle::installed::{self, Rejection};
-use midshift_core::identity::{Caller, SessionSecret};
+use midshift_core::identity::{Caller, RobotIdentity, SessionSecret};
 use midshift_core::item::{Expect, Item};
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal};
 use midshift_core::robot::Lane;
-use midshift_core::rows::{Record, Revision, Writer};
+use midshift_core::rows::{Key, Record, Revision, Writer};
 use midshift_core::session::{LaneMark, Session};
 use midshift_core::update::Installed;
 use midshift_proto::session::{Hello, LaneAck, PROTOCOL_VERSION, Previous, Welcome};
-use midshift_store::{CommitError, load};
+use midshift_store::{CommitError, Error, Store, find_record};
 use std::sync::Arc;
 use tokio::sync::mpsc;
 use tracing::field::Empty;
@@ -66,8 +66,7 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
         return Err(unavailable("this gateway has lost the database"));
     }
     for _ in 0..TRIES {
-        let row = load::<Session>(store, hello.robot_id.as_str()).await.map_err(unavailable)?;
-        let mark = mark_of(inner, hello).await?;
+        let Known { row, mark, robot } = read_known(store, hello).await.map_err(unavailable)?;
         let status = status_of(inner, hello).await?;
         // A secret lies in a file and can be copied with it: of another start it proves nothing while the older session is heard.
         let proven = row.as_ref().is_some_and(|(row, _)| {
@@ -82,7 +81,7 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
         let now = inner.parts.clock.now();
         let last = row.as_ref().map_or(0, |(r, _)| r.session_epoch);
         let session_epoch = (last + 1).max(now.wall.0.max(0) as u64);
-        let enrolment = Enrolment::read(inner, &hello.robot_id, by).await.map_err(unavailable)?;
+        let enrolment = Enrolment::judge(robot, &hello.robot_id, by);
         let robot = enrolment.own().cloned();
         let waits = match enrolment {
             Enrolment::Unknown(machine) => Some(Waits::Enrolment(machine)),
@@ -128,10 +127,22 @@ pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, R
     Err(Refusal::new(Kind::Conflict, Code::CloneSeen))
 }
 
-async fn mark_of(inner: &Inner, hello: &Hello) -> Result<(LaneMark, Revision), Refusal> {
+/// What the rows say of a robot, all of one moment.
+struct Known {
+    /// Its newest session.
+    row: Option<(Session, Revision)>,
+    /// Durable numbers of its ring.
+    mark: (LaneMark, Revision),
+    /// Its enrolment.
+    robot: Option<RobotIdentity>,
+}
+
+async fn read_known(store: &dyn Store, hello: &Hello) -> Result<Known, Error> {
     let fresh = LaneMark::fresh(hello.robot_id.clone(), &hello.ring);
-    let found = load::<LaneMark>(inner.parts.store.as_ref(), &fresh.id()).await.map_err(unavailable)?;
-    Ok(found.unwrap_or((fresh, Revision(0))))
+    let keys = [Session::TABLE, RobotIdentity::TABLE].map(|table| Key::new(table, hello.robot_id.as_str()));
+    let rows = store.get(keys.into_iter().chain([Key::new(LaneMark::TABLE, &*fresh.id())]).collect()).await?;
+    let mark = find_record(&rows)?.unwrap_or((fresh, Revision(0)));
+    Ok(Known { row: find_record(&rows)?, mark, robot: find_record(&rows)?.map(|(robot, _)| robot) })
 }
 
 /// Durable STATUS of the robot's ring, which another gateway may have kept.

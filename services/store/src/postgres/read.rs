@@ -3,18 +3,17 @@
 //! Invariant: what must hold together (rows and their number, entries and the head) is read in one transaction that sees one
 //! snapshot. Because whoever commits has the head row for itself, a snapshot that shows a number shows everything before it.
 
-use super::write_sql::is_text;
 use crate::audit::{self, Heads};
 use crate::gather::Gathered;
 use crate::queue::unavailable;
-use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
+use crate::sql::{self, ENTRY_READ, entry, is_text, row};
 use crate::store::{Wanted, page_of};
-use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Snapshot};
+use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Naming, Row, RowSelection, Seq, Table};
 use sqlx::postgres::PgRow;
 use sqlx::{AssertSqlSafe, PgConnection, PgPool, Postgres, Row as _, Transaction};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 /// One snapshot for all statements, whatever the database's own default is.
 pub(super) const BEGIN: &str = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY";
@@ -24,32 +23,24 @@ pub(super) async fn begin(readers: &PgPool) -> Result<Transaction<'static, Postg
 }
 
 pub(super) async fn get(readers: &PgPool, site_id: &SiteId, keys: &[Key]) -> Result<Vec<Row>, sqlx::Error> {
-    let mut ids: BTreeMap<Table, Vec<&str>> = BTreeMap::new();
-    for key in keys.iter().filter(|key| is_text(&key.id)) {
-        ids.entry(key.table).or_default().push(&key.id);
+    Ok(sql::in_order(keys, rows_by_ids(readers, site_id, keys).await?))
+}
+
+async fn rows_by_ids<'c>(
+    executor: impl sqlx::Executor<'c, Database = Postgres>,
+    site_id: &SiteId,
+    keys: impl IntoIterator<Item = &Key>,
+) -> Result<Vec<Row>, sqlx::Error> {
+    let ids = sql::ids_by_table(keys);
+    if ids.is_empty() {
+        return Ok(Vec::new());
     }
-    let mut found: BTreeMap<Key, Row> = BTreeMap::new();
-    let mut take = |table: Table, rows: &[PgRow]| -> Result<(), sqlx::Error> {
-        for one in rows {
-            let one = row(table, one)?;
-            found.insert(one.key.clone(), one);
-        }
-        Ok(())
-    };
-    if ids.len() == 1 {
-        // One statement needs no transaction to be of one moment.
-        for (table, ids) in ids {
-            let select = sqlx::query(AssertSqlSafe(by_ids(table))).bind(site_id.as_str()).bind(ids);
-            take(table, &select.fetch_all(readers).await?)?;
-        }
-    } else if !ids.is_empty() {
-        let mut transaction = begin(readers).await?;
-        for (table, ids) in ids {
-            let select = sqlx::query(AssertSqlSafe(by_ids(table))).bind(site_id.as_str()).bind(ids);
-            take(table, &select.fetch_all(&mut *transaction).await?)?;
-        }
+    let text = sql::by_ids(ids.keys().copied(), |bound| format!("= ANY(${bound})"));
+    let mut select = sqlx::query(AssertSqlSafe(text)).bind(site_id.as_str());
+    for ids in ids.into_values() {
+        select = select.bind(ids.into_iter().collect::<Vec<_>>());
     }
-    Ok(keys.iter().filter_map(|key| found.get(key).cloned()).collect())
+    select.fetch_all(executor).await?.iter().map(sql::row_of_any).collect()
 }
 
 /// Each state is read from its own stretch of the index and the stretches are merged, as with SQLite.
@@ -132,18 +123,8 @@ pub(super) async fn read(
         if missing.is_empty() && is_whole {
             return Ok(gathered.at(seq));
         }
-        for (table, ids) in missing {
-            for ids in ids.chunks(GET_KEYS_MAX) {
-                let ids: Vec<&str> = ids.iter().map(|id| &**id).filter(|id| is_text(id)).collect();
-                let select = sqlx::query(AssertSqlSafe(by_ids(table))).bind(site_id.as_str()).bind(ids);
-                gathered.add(rows_of(table, &select.fetch_all(&mut *transaction).await?)?);
-            }
-        }
+        gathered.add(rows_by_ids(&mut *transaction, site_id, &missing).await?);
     }
-}
-
-fn by_ids(table: Table) -> String {
-    format!("SELECT {ROW_READ} FROM {} WHERE site_id = $1 AND id = ANY($2)", table.name())
 }
 
 fn rows_of(table: Table, rows: &[PgRow]) -> Result<Vec<Row>, sqlx::Error> {

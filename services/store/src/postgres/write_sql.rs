@@ -159,7 +159,7 @@ pub(super) async fn read_current_revisions<'k>(
     let mut found: HashMap<Key, CurrentRevision> = keys.map(|key| (key.clone(), None)).collect();
     let mut ids: BTreeMap<Table, Vec<String>> = BTreeMap::new();
     // An item with such an id is refused when it is judged.
-    for key in found.keys().filter(|key| is_text(&key.id)) {
+    for key in found.keys().filter(|key| sql::is_text(&key.id)) {
         ids.entry(key.table).or_default().push(key.id.to_string());
     }
     let mut parts = Parts::new(site_id)?;
@@ -178,11 +178,6 @@ pub(super) async fn read_current_revisions<'k>(
         found.insert(Key::new(*table, row.try_get::<&str, _>(1)?), Some(revision));
     }
     Ok(found)
-}
-
-/// Whether PostgreSQL can be asked about it: no row has a NUL in its id.
-pub(super) fn is_text(text: &str) -> bool {
-    !text.as_bytes().contains(&0)
 }
 
 /// Takes the entries of a log up to `up_to` out, and remembers that they are gone.

@@ -90,10 +90,12 @@ impl DataFile {
         Ok(connection)
     }
 
-    /// Connections that only read.
+    /// Connections that only read. They are not asked whether they live before each use: nothing ends one of a file, and the question would be one
+    /// hop more to its thread and back.
     pub(crate) async fn readers(&self) -> Result<SqlitePool, OpenError> {
         SqlitePoolOptions::new()
             .max_connections(READERS)
+            .test_before_acquire(false)
             .connect_with(self.options().pragma("query_only", "1"))
             .await
             .map_err(|source| OpenError::Sql { doing: "opening for reading", source })

@@ -7,14 +7,14 @@ use super::write_sql::placeholders;
 use crate::audit::{self, Heads};
 use crate::gather::Gathered;
 use crate::queue::unavailable;
-use crate::sql::{self, ENTRY_READ, ROW_READ, entry, row};
+use crate::sql::{self, ENTRY_READ, entry, row};
 use crate::store::{Wanted, page_of};
 use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Naming, Row, RowSelection, Seq, Table};
 use sqlx::sqlite::{SqliteArguments, SqliteRow};
 use sqlx::{AssertSqlSafe, Row as _, Sqlite, SqliteConnection, SqlitePool};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 /// Ids of one statement.
@@ -29,39 +29,24 @@ fn prepared<'q>(sql: String) -> Statement<'q> {
 }
 
 pub(super) async fn get(readers: &SqlitePool, site_id: &SiteId, keys: &[Key]) -> Result<Vec<Row>, sqlx::Error> {
-    let mut ids: BTreeMap<Table, Vec<&Arc<str>>> = BTreeMap::new();
-    for key in keys {
-        ids.entry(key.table).or_default().push(&key.id);
-    }
-    let slices: Vec<_> =
-        ids.iter().flat_map(|(table, ids)| ids.chunks(IDS_PER_STATEMENT).map(|ids| (*table, ids))).collect();
-    let mut found: BTreeMap<Key, Row> = BTreeMap::new();
-    if let [(table, ids)] = slices[..] {
-        // One statement needs no transaction to be of one moment.
-        let rows = select(site_id, table, ids).fetch_all(readers).await?;
-        add_rows(&mut found, table, &rows)?;
-    } else {
-        let mut transaction = readers.begin().await?;
-        for (table, ids) in slices {
-            let rows = select(site_id, table, ids).fetch_all(&mut *transaction).await?;
-            add_rows(&mut found, table, &rows)?;
-        }
-    }
-    Ok(keys.iter().filter_map(|key| found.get(key).cloned()).collect())
+    Ok(sql::in_order(keys, rows_by_ids(readers, site_id, keys).await?))
 }
 
-fn select<'q>(site_id: &'q SiteId, table: Table, ids: &[&Arc<str>]) -> Statement<'q> {
-    let list = placeholders(1, ids.len());
-    let sql = format!("SELECT {ROW_READ} FROM {} WHERE site_id = ? AND id IN {list}", table.name());
-    ids.iter().fold(prepared(sql).bind(site_id.as_str()), |select, id| select.bind(Arc::clone(id)))
-}
-
-fn add_rows(found: &mut BTreeMap<Key, Row>, table: Table, rows: &[SqliteRow]) -> Result<(), sqlx::Error> {
-    for one in rows {
-        let one = row(table, one)?;
-        found.insert(one.key.clone(), one);
+async fn rows_by_ids<'c>(
+    executor: impl sqlx::Executor<'c, Database = Sqlite>,
+    site_id: &SiteId,
+    keys: impl IntoIterator<Item = &Key>,
+) -> Result<Vec<Row>, sqlx::Error> {
+    let ids = sql::ids_by_table(keys);
+    if ids.is_empty() {
+        return Ok(Vec::new());
     }
-    Ok(())
+    let text = sql::by_ids(ids.keys().copied(), |bound| format!("IN (SELECT value FROM json_each(${bound}))"));
+    let mut select = prepared(text).bind(site_id.as_str());
+    for ids in ids.into_values() {
+        select = select.bind(serde_json::to_string(&ids).map_err(|error| sqlx::Error::Encode(error.into()))?);
+    }
+    select.fetch_all(executor).await?.iter().map(sql::row_of_any).collect()
 }
 
 /// Each state is read from its own stretch of the index and the stretches are merged: with a list of states SQLite would walk the
@@ -138,13 +123,7 @@ pub(super) async fn read(
         if missing.is_empty() && is_whole {
             return Ok(gathered.at(seq));
         }
-        for (table, ids) in missing {
-            for ids in ids.chunks(IDS_PER_STATEMENT) {
-                let ids: Vec<&Arc<str>> = ids.iter().collect();
-                let rows = select(site_id, table, &ids).fetch_all(&mut *transaction).await?;
-                gathered.add(rows_of(table, &rows)?);
-            }
-        }
+        gathered.add(rows_by_ids(&mut *transaction, site_id, &missing).await?);
     }
 }
 
