@@ -255,3 +255,17 @@ async fn a_time_that_is_none_is_refused_and_not_ignored() {
     let answer = world.client().await.ask("/who", Some("soon")).await.expect("an answer").answer();
     assert_eq!((answer.grpc, answer.violations[0].field.as_str()), (Code::InvalidArgument, "grpc-timeout"));
 }
+
+#[tokio::test]
+async fn a_fault_of_a_service_ends_the_call_that_met_it_and_nothing_else_on_its_connection() {
+    let world = World::open(Config::default()).await;
+    let mut client = world.client().await;
+    let session = within(client.begin("/pulse", None).await.expect("a stream")).await.expect("its head");
+    for _ in 0..3 {
+        let answer = client.asked("/panic").await.answer();
+        assert_eq!((answer.grpc, answer.code), (Code::Internal, Some(Reason::Internal)));
+    }
+    client.asked("/poke").await;
+    assert!(within(session.into_body().data()).await.expect("a word").is_ok());
+    assert_eq!((world.counter("midshift_edge_panics_total", ("port", "business")), world.requests_open()), (3, 1));
+}

@@ -17,7 +17,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::body::Body;
 use tower::Service;
 
-/// Answers by path: `/who` tells who asked, `/hang` never answers, `/stream` answers and goes on without a word, `/pulse` says a word for each
+/// Answers by path: `/who` tells who asked, `/hang` never answers, `/panic` has a fault, `/stream` answers and goes on without a word, `/pulse` says a word for each
 /// `/poke`, `/go_away` ends when its connection is about to be asked to go. Any path with a header `hold` is as `/stream`; with `deny`
 /// it says that it denies what the port let in.
 #[derive(Clone, Default)]
@@ -55,6 +55,7 @@ async fn answer(request: Request<Body>, poked: Arc<Notify>) -> Response<Body> {
     }
     match path.as_str() {
         "/hang" => std::future::pending().await,
+        "/panic" => panic!("a fault of a service"),
         "/stream" | "/midshift.telemetry.v1.TelemetryService/WatchRobots" => {
             grpc(Body::new(Silent { _request: request.into_body() }))
         }
