@@ -198,7 +198,8 @@ impl Port {
             Reason::Denied(denied) => return self.denied(&peer, denied),
             // It hears why and is not waited for.
             Reason::Unused(Unused::NoRequest) => (End::NoRequest, Some(Duration::ZERO)),
-            Reason::Unused(Unused::Idle) => (End::Idle, Some(Duration::ZERO)),
+            // A request that it sent before it read this is answered: its peer pauses as long as this port has patience.
+            Reason::Unused(Unused::Idle) => (End::Idle, Some(std(limits::CONNECTION_GRACE))),
             Reason::Old => (End::Old, self.config.age.map(|age| std(age.grace))),
             // Whoever stopped the port counts the time for all.
             Reason::Stop => (End::Stopped, None),

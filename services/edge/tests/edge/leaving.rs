@@ -1,6 +1,6 @@
 //! How connections end: at the stop of the port and for their age, told before, and cut when they do not go.
 
-use crate::frames::{END_STREAM, GOAWAY, HEADERS, Raw, dial, until_closed};
+use crate::frames::{DATA, END_STREAM, GOAWAY, HEADERS, Raw, dial, until_closed};
 use crate::world::{HERE, SOON, World, within};
 use midshift_core::reason::Code as Reason;
 use midshift_core::time::LinkDuration;
@@ -94,4 +94,17 @@ async fn an_old_connection_that_does_not_go_is_closed_after_its_grace() {
     assert!(frames.iter().any(|f| f.kind == GOAWAY), "{frames:?}");
     world.closed_for("old").await;
     assert_eq!(world.stopped().await, Served::default());
+}
+
+#[tokio::test]
+async fn a_call_that_crosses_the_end_of_an_idle_connection_is_answered() {
+    let world = World::open(Config { idle: SOON, ..Config::default() }).await;
+    let mut pausing = Raw::dial(world.address, HERE).await;
+    pausing.call(1, "/who").await;
+    within(pausing.next(GOAWAY)).await.expect("asked to go");
+    pausing.call(3, "/pulse").await;
+    let head = within(pausing.next(HEADERS)).await.expect("the head of a stream");
+    world.client().await.asked("/poke").await;
+    let word = within(pausing.next(DATA)).await.expect("a word");
+    assert_eq!((head.stream, word.stream, &*word.payload), (3, 3, &b"beat"[..]));
 }
