@@ -36,6 +36,7 @@ mod watch;
 mod worker;
 
 use clap::{Parser, Subcommand};
+use outcome::RunOutcome;
 use std::future::Future;
 use std::path::PathBuf;
 
@@ -88,34 +89,9 @@ struct Args {
 #[expect(clippy::print_stdout, reason = "the table is what this program is for")]
 fn main() -> anyhow::Result<()> {
     let args = Args::parse();
-    let mut failed = Vec::new();
-    let figures = match args.name {
-        Name::Plan(args) => wait(plan::run(args, &note))?,
-        Name::Submit(args) => wait(submit::run(args, &note))?,
-        Name::Task(args) => wait(task::run(args, &note))?,
-        Name::Offer(args) => wait(offer::run(args, &note))?,
-        Name::Link(args) => wait(link::run(args, &note))?,
-        Name::Start(args) => wait(start::run(args, &note))?,
-        Name::Reads(args) => wait(reads::run(args, &note))?,
-        Name::Soak(args) => wait(soak::run(args, &note))?,
-        Name::Gates(args) => gates::run(args)?,
-        Name::Ota(args) => {
-            let outcome = wait(async { Ok(ota::run(args, &note).await) })?;
-            failed = outcome.failed;
-            outcome.figures
-        }
-        Name::Stop(args) => {
-            let outcome = wait(async { Ok(stop::run(args, &note).await) })?;
-            failed = outcome.failed;
-            outcome.figures
-        }
-        Name::Edge(args) => {
-            let outcome = wait(async { Ok(edge::run(args, &note).await) })?;
-            failed = outcome.failed;
-            outcome.figures
-        }
-        Name::Watch(args) => wait(watch::run(args, &note))?,
+    let RunOutcome { figures, failed } = match args.name {
         Name::Child(args) => return roles::play(args),
+        name => measure(name)?,
     };
     print!("{}", figure::table(&figures));
     if let Some(path) = args.json {
@@ -123,6 +99,26 @@ fn main() -> anyhow::Result<()> {
     }
     anyhow::ensure!(failed.is_empty(), "not measured: {}", failed.join("; "));
     Ok(())
+}
+
+fn measure(name: Name) -> anyhow::Result<RunOutcome> {
+    let figures = match name {
+        Name::Plan(args) => wait(plan::run(args, &note))?,
+        Name::Submit(args) => wait(submit::run(args, &note))?,
+        Name::Task(args) => wait(task::run(args, &note))?,
+        Name::Offer(args) => wait(offer::run(args, &note))?,
+        Name::Link(args) => wait(link::run(args, &note))?,
+        Name::Start(args) => wait(start::run(args, &note))?,
+        Name::Reads(args) => wait(reads::run(args, &note))?,
+        Name::Soak(args) => return wait(async { Ok(soak::run(args, &note).await) }),
+        Name::Gates(args) => gates::run(args)?,
+        Name::Ota(args) => return wait(async { Ok(ota::run(args, &note).await) }),
+        Name::Stop(args) => return wait(async { Ok(stop::run(args, &note).await) }),
+        Name::Edge(args) => return wait(async { Ok(edge::run(args, &note).await) }),
+        Name::Watch(args) => wait(watch::run(args, &note))?,
+        Name::Child(_) => anyhow::bail!("a role measures nothing"),
+    };
+    Ok(RunOutcome { figures, failed: Vec::new() })
 }
 
 fn wait<T>(work: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {

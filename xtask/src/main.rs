@@ -57,8 +57,11 @@ enum Verb {
         /// failing seed alone: `torture kills|simulation|stops|skew|stories|night --from SEED --seeds 1`; one of updates says its own command.
         #[arg(long)]
         from: Option<u64>,
+        /// How long a soak lasts on each engine; unless told, 1.5.
+        #[arg(long)]
+        hours: Option<f64>,
         /// What runs every night: whole stories and whole nights with four seeds each, and old sites.
-        #[arg(long, conflicts_with_all = ["sweeps", "seeds"])]
+        #[arg(long, conflicts_with_all = ["sweeps", "seeds", "hours"])]
         nightly: bool,
     },
     /// The stack of a compose file as processes of this machine, without docker.
@@ -79,9 +82,12 @@ fn main() -> ExitCode {
     let outcome = workspace::Workspace::find().and_then(|workspace| match Cli::parse().verb {
         Verb::Test(asked) => suite::test(&workspace, &asked),
         Verb::Torture { nightly: true, from, .. } => {
-            sweep::torture(&workspace, &sweep::NIGHTLY, from, Some(sweep::NIGHTLY_SEEDS))
+            let amount = sweep::Amount { from, seeds: Some(sweep::NIGHTLY_SEEDS), hours: None };
+            sweep::torture(&workspace, &sweep::NIGHTLY, amount)
         }
-        Verb::Torture { sweeps, seeds, from, .. } => sweep::torture(&workspace, &sweeps, from, seeds),
+        Verb::Torture { sweeps, seeds, from, hours, .. } => {
+            sweep::torture(&workspace, &sweeps, sweep::Amount { from, seeds, hours })
+        }
         Verb::Stack(stack::Verb::Test { binary, docker: true, .. }) => {
             docker::test(&workspace, &stack::midshift(&workspace, binary)?)
         }

@@ -17,6 +17,8 @@ use std::process::Command;
 
 /// Robots of a split stack under load.
 const SPLIT_ROBOTS: &str = "200";
+/// Hours of a soak on each engine, unless told.
+const SOAK_HOURS: f64 = 1.5;
 /// Tasks that are over at an old site.
 const OLD_TASKS: &str = "1000000";
 
@@ -50,6 +52,9 @@ pub enum Sweep {
     Night,
     /// Starts, takeovers, lists, pruning and backups at a site where a million tasks are over, on both engines; it draws nothing.
     OldSites,
+    /// 500 robots at work, watches that come and go, roll-outs there and back, on each engine: every task that was acknowledged is looked for at the end, and
+    /// memory, times and files of the last third are told beside those of the second. As long as --hours says; it draws nothing.
+    Soak,
 }
 
 /// What runs every night by `torture --nightly`.
@@ -59,7 +64,7 @@ pub const NIGHTLY_SEEDS: u64 = 4;
 
 impl Sweep {
     /// All, in the order in which they are run.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::Kills,
         Self::Simulation,
         Self::Players,
@@ -72,6 +77,7 @@ impl Sweep {
         Self::Stories,
         Self::Night,
         Self::OldSites,
+        Self::Soak,
     ];
 
     fn seeds(self) -> u64 {
@@ -82,7 +88,7 @@ impl Sweep {
             Self::Sockets => 1_000,
             Self::Stops => 100,
             Self::Skew => 500,
-            Self::Split | Self::Latch | Self::Night | Self::OldSites => 1,
+            Self::Split | Self::Latch | Self::Night | Self::OldSites | Self::Soak => 1,
             Self::Stories => 2,
         }
     }
@@ -92,7 +98,7 @@ impl Sweep {
         match self {
             Self::Kills | Self::Simulation | Self::Players | Self::Sockets => true,
             Self::Updates | Self::Stops | Self::Skew | Self::Stories | Self::Night => true,
-            Self::Split | Self::Latch | Self::OldSites => false,
+            Self::Split | Self::Latch | Self::OldSites | Self::Soak => false,
         }
     }
 
@@ -104,7 +110,7 @@ impl Sweep {
     /// Runs it as every night; whether all laws held. Tests are added to `count`.
     pub fn nightly(self, workspace: &Workspace, count: &mut Count) -> Result<bool> {
         let seeds = if matches!(self, Self::Stories | Self::Night) { NIGHTLY_SEEDS } else { self.seeds() };
-        let mut runs = Runs { workspace, count: Count::default() };
+        let mut runs = Runs { workspace, count: Count::default(), hours: SOAK_HOURS };
         let held = self.run(&mut runs, 1, seeds);
         *count += runs.count;
         held
@@ -122,6 +128,7 @@ impl Sweep {
             Self::Skew => runs.seeded("simulation", "skew::", from, seeds),
             Self::Split => runs.split(seeds),
             Self::OldSites => runs.counted(runs.test("e2e", "old_site::").env("MIDSHIFT_OLD_TASKS", OLD_TASKS)),
+            Self::Soak => runs.soak(),
             Self::Updates => {
                 let drawn = runs.seeded("agent", "drawn_cuts::", from, seeds)?;
                 Ok(drawn && runs.every_site("agent", "power::")?)
@@ -131,13 +138,25 @@ impl Sweep {
     }
 }
 
+/// How much of each sweep.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Amount {
+    /// The first seed.
+    pub from: Option<u64>,
+    /// How many.
+    pub seeds: Option<u64>,
+    /// How long a soak lasts on each engine.
+    pub hours: Option<f64>,
+}
+
 /// Runs these sweeps, or all; whether all laws held.
-pub fn torture(workspace: &Workspace, sweeps: &[Sweep], from: Option<u64>, seeds: Option<u64>) -> Result<bool> {
-    ensure!(seeds != Some(0), "--seeds must be at least 1");
-    let from = first_seed(sweeps, from)?;
-    let (mut runs, mut held) = (Runs { workspace, count: Count::default() }, true);
+pub fn torture(workspace: &Workspace, sweeps: &[Sweep], amount: Amount) -> Result<bool> {
+    ensure!(amount.seeds != Some(0), "--seeds must be at least 1");
+    let from = first_seed(sweeps, amount.from)?;
+    let hours = soak_hours(sweeps, amount.hours)?;
+    let (mut runs, mut held) = (Runs { workspace, count: Count::default(), hours }, true);
     for sweep in Sweep::ALL.into_iter().filter(|s| sweeps.is_empty() || sweeps.contains(s)) {
-        held &= sweep.run(&mut runs, from, seeds.unwrap_or(sweep.seeds()))?;
+        held &= sweep.run(&mut runs, from, amount.seeds.unwrap_or(sweep.seeds()))?;
     }
     Ok(held)
 }
@@ -149,10 +168,21 @@ fn first_seed(sweeps: &[Sweep], from: Option<u64>) -> Result<u64> {
     Ok(from.unwrap_or(1))
 }
 
+/// How long a soak of these sweeps, or of all, lasts.
+fn soak_hours(sweeps: &[Sweep], hours: Option<f64>) -> Result<f64> {
+    let soaks = sweeps.is_empty() || sweeps.contains(&Sweep::Soak);
+    ensure!(hours.is_none() || soaks, "--hours is for soak, which you did not name: leave it out");
+    let hours = hours.unwrap_or(SOAK_HOURS);
+    ensure!(hours > 0.0 && hours.is_finite(), "--hours must be more than 0");
+    Ok(hours)
+}
+
 /// Calls of `cargo test`, and what their tests added up to.
 struct Runs<'w> {
     workspace: &'w Workspace,
     count: Count,
+    /// How long a soak lasts.
+    hours: f64,
 }
 
 impl Runs<'_> {
@@ -212,6 +242,13 @@ impl Runs<'_> {
         Ok(true)
     }
 
+    /// The bench's own run, which fails where a task is lost.
+    fn soak(&self) -> Result<bool> {
+        let minutes = (self.hours * 60.0).to_string();
+        let arguments = ["run", "--release", "-p", "midshift-bench", "--", "soak", "--minutes", &minutes];
+        run::succeeds(&mut self.workspace.cargo(&arguments))
+    }
+
     fn counted(&mut self, command: &mut Command) -> Result<bool> {
         let mut count = Count::default();
         let succeeded = run::reading(command, |line| count.add(line))?;
@@ -227,7 +264,7 @@ pub fn golden(workspace: &Workspace) -> Result<bool> {
     ensure!(parts::build(workspace)?, "the programs do not build");
     let mut command = workspace.cargo(&["test", "--workspace", "--tests", "--no-fail-fast", "--", "golden"]);
     workspace.export_programs(&mut command)?;
-    let passed = Runs { workspace, count: Count::default() }.counted(command.env("BLESS", "1"))?;
+    let passed = Runs { workspace, count: Count::default(), hours: SOAK_HOURS }.counted(command.env("BLESS", "1"))?;
     run::tell_person("next: git diff, and read it before you commit it");
     Ok(passed)
 }
@@ -247,5 +284,13 @@ mod tests {
         assert_eq!(first_seed(&[Sweep::Split, Sweep::Kills], Some(7)).expect("one draws"), 7);
         assert_eq!(first_seed(&[Sweep::Split], None).expect("no seed"), 1);
         assert!(first_seed(&[Sweep::Split, Sweep::Latch], Some(7)).is_err());
+    }
+
+    #[test]
+    fn hours_are_refused_where_nothing_soaks_and_where_they_are_none() {
+        assert_eq!(soak_hours(&[Sweep::Soak, Sweep::Kills], Some(8.0)).expect("a soak"), 8.0);
+        assert_eq!(soak_hours(&[], None).expect("all"), SOAK_HOURS);
+        assert!(soak_hours(&[Sweep::Kills], Some(8.0)).is_err());
+        assert!([0.0, -1.0, f64::NAN, f64::INFINITY].iter().all(|hours| soak_hours(&[], Some(*hours)).is_err()));
     }
 }

@@ -126,6 +126,11 @@ impl<T: Send + 'static> Beside<T> {
         self.stop.cancel();
         self.task.await.context("what went on beside panicked")?
     }
+
+    /// Whether it goes on; what does not has failed, and [`Self::stop`] says how.
+    pub fn goes_on(&self) -> bool {
+        !self.task.is_finished()
+    }
 }
 
 /// Roll-outs and ways back so far.

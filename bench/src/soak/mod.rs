@@ -6,6 +6,7 @@ mod samples;
 
 use crate::engine::{Bed, Engine, EngineArgs};
 use crate::figure::Figure;
+use crate::outcome::{RunOutcome, unless_stopped};
 use crate::ota::server::rollouts::Rollouts;
 use crate::ota::server::scene::{Floor, attached};
 use anyhow::ensure;
@@ -52,14 +53,27 @@ struct Run {
 }
 
 /// Runs on one engine after the other.
-pub async fn run(args: SoakArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> {
-    let mut figures = Vec::new();
-    for engine in args.engine.engines(say) {
-        let bed = engine.bed(args.engine.dir.as_ref())?;
-        let run = soak(&args, &engine, &bed, say).await?;
-        figures.extend(figures_of(&engine, &run));
-    }
-    Ok(figures)
+pub async fn run(args: SoakArgs, say: &dyn Fn(&str)) -> RunOutcome {
+    let mut outcome = RunOutcome::default();
+    let all = async {
+        for engine in args.engine.engines(say) {
+            let run = async {
+                let bed = engine.bed(args.engine.dir.as_ref())?;
+                soak(&args, &engine, &bed, say).await
+            };
+            let run = run.await;
+            let part = format!("soak{}", engine.suffix());
+            if let Ok(Run { missing, unfinished, .. }) = run
+                && missing + unfinished > 0
+            {
+                outcome.failed.push(format!("{part}: {missing} tasks are not there, {unfinished} have no end"));
+            }
+            outcome.add(&part, run.map(|run| figures_of(&engine, &run)));
+        }
+    };
+    let ended_early = unless_stopped(all).await;
+    outcome.failed.extend(ended_early);
+    outcome
 }
 
 async fn soak(args: &SoakArgs, engine: &Engine, bed: &Bed<'_>, say: &dyn Fn(&str)) -> anyhow::Result<Run> {
@@ -79,7 +93,7 @@ async fn soak(args: &SoakArgs, engine: &Engine, bed: &Bed<'_>, say: &dyn Fn(&str
     let mut due = interval(Duration::from_secs(1) / args.rate.max(1));
     due.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut look = interval(LOOK_EVERY);
-    while begun.elapsed() < long {
+    while begun.elapsed() < long && releasing.goes_on() && watching.goes_on() {
         tokio::select! {
             _ = look.tick() => {
                 let open = server.ask(OPEN)?;
