@@ -12,7 +12,7 @@ use midshift_core::unknown_rows;
 use midshift_proto::convert::task::{TaskView, encode_task};
 use midshift_proto::task::v1;
 use midshift_store::{Error, Store, load};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// A task with all that is shown of it.
 pub struct TaskRows {
@@ -87,19 +87,16 @@ pub async fn read_many(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows
 
 /// The first of these robots that is not enrolled and has never connected.
 pub async fn unknown_robot<'r>(store: &dyn Store, robot_ids: &'r [RobotId]) -> Result<Option<&'r RobotId>, Refusal> {
-    let mut keys = Vec::new();
-    for table in [Table::RobotIdentity, Table::Session] {
-        keys.extend(robot_ids.iter().map(|id| Key::new(table, id.as_str())));
-    }
-    let known = by_id(store, keys).await.map_err(unavailable)?;
-    Ok(robot_ids.iter().find(|id| !known.contains_key(id.as_str())))
+    let keys = |id: &RobotId| [Table::RobotIdentity, Table::Session].map(|table| Key::new(table, id.as_str()));
+    let known = by_key(store, robot_ids.iter().flat_map(keys).collect()).await.map_err(unavailable)?;
+    Ok(robot_ids.iter().find(|id| !keys(id).iter().any(|key| known.contains_key(key))))
 }
 
-async fn by_id(store: &dyn Store, keys: Vec<Key>) -> Result<BTreeMap<String, Row>, Error> {
+async fn by_key(store: &dyn Store, keys: Vec<Key>) -> Result<BTreeMap<Key, Row>, Error> {
     if keys.is_empty() {
         return Ok(BTreeMap::new());
     }
-    Ok(store.get(keys).await?.into_iter().map(|row| (row.key.id.to_string(), row)).collect())
+    Ok(store.get(keys).await?.into_iter().map(|row| (row.key.clone(), row)).collect())
 }
 
 /// What a row holds; none: a value of a newer version.
@@ -125,26 +122,20 @@ async fn join(store: &dyn Store, ids: &[TaskId]) -> Result<Vec<TaskRows>, Error>
             ),
         }
     }
-    let wanted = states.values().filter_map(|(s, _)| s.attempt_id()).map(|a| Key::new(Table::Attempt, a.to_string()));
-    let attempts = by_id(store, wanted.collect()).await?;
-    let robots =
-        states.values().filter_map(|(s, _)| s.robot_id.as_ref()).map(|r| Key::new(Table::RobotAuthority, r.as_str()));
-    let robots: std::collections::BTreeSet<Key> = robots.collect();
-    let authority = by_id(store, robots.into_iter().collect()).await?;
+    let attempts = states.values().filter_map(|(s, _)| s.attempt_id()).map(|a| Key::new(Table::Attempt, a.to_string()));
+    let robots = states.values().filter_map(|(s, _)| s.robot_id.as_ref());
+    let robots = robots.map(|r| Key::new(Table::RobotAuthority, r.as_str()));
+    let named: BTreeSet<Key> = attempts.chain(robots).collect();
+    let named = by_key(store, named.into_iter().collect()).await?;
     let mut tasks = Vec::new();
     for id in ids {
         let (Some(intake), Some((state, revision))) = (intakes.remove(id.as_str()), states.remove(id.as_str())) else {
             continue;
         };
-        let attempt =
-            state.attempt_id().and_then(|a| attempts.get(&a.to_string())).map(known::<Attempt>).transpose()?.flatten();
-        let holder = state
-            .robot_id
-            .as_ref()
-            .and_then(|r| authority.get(r.as_str()))
-            .map(known::<RobotAuthority>)
-            .transpose()?
-            .flatten();
+        let attempt = state.attempt_id().map(|a| Key::new(Table::Attempt, a.to_string()));
+        let attempt = attempt.and_then(|key| named.get(&key)).map(known::<Attempt>).transpose()?.flatten();
+        let holder = state.robot_id.as_ref().map(|r| Key::new(Table::RobotAuthority, r.as_str()));
+        let holder = holder.and_then(|key| named.get(&key)).map(known::<RobotAuthority>).transpose()?.flatten();
         let kept = holder.is_some_and(|h| keeps(&h, &state));
         let allowed = allowed_resolutions(state.phase, state.opened_robot_id.is_some(), kept);
         tasks.push(TaskRows { intake, state, revision, attempt, allowed });
@@ -166,11 +157,11 @@ pub async fn robot_kept(store: &dyn Store, state: &TaskState) -> Result<bool, Er
 
 /// Whether there is a task of this id that a caller may see.
 pub async fn are_seen(store: &dyn Store, site: &Site, by: &Caller, ids: &[TaskId]) -> Result<Vec<bool>, Refusal> {
-    let keys = ids.iter().map(|id| Key::new(Table::TaskIntake, id.as_str())).collect();
-    let found = by_id(store, keys).await.map_err(unavailable)?;
+    let key = |id: &TaskId| Key::new(Table::TaskIntake, id.as_str());
+    let found = by_key(store, ids.iter().map(key).collect()).await.map_err(unavailable)?;
     let seen = |row: &Row| -> Result<bool, BadRow> {
         Ok(by.is_permitted_everywhere(Permission::Read) || sees(site, by, &row.decode::<TaskIntake>()?))
     };
-    let seen = ids.iter().map(|id| found.get(id.as_str()).map_or(Ok(false), seen));
+    let seen = ids.iter().map(|id| found.get(&key(id)).map_or(Ok(false), seen));
     seen.collect::<Result<_, BadRow>>().map_err(unavailable)
 }
