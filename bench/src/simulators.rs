@@ -11,7 +11,7 @@ pub const SIMULATORS: usize = 2;
 /// All robots are attached by then.
 const ATTACH_WITHIN: Duration = Duration::from_secs(300);
 /// How often that is looked at.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+const LOOK_EVERY: Duration = Duration::from_millis(100);
 
 /// Starts all robots of a site, beside the first core.
 pub fn start_robots(server: &Child, map: &Path, robots: usize) -> anyhow::Result<Vec<Child>> {

@@ -535,7 +535,7 @@ pub const DENIED_LAST: LinkDuration = LinkDuration::from_secs(3);
 pub const REVOKED_RETRY: LinkDuration = LinkDuration::from_secs(60);
 /// Hellos of robots that one process carries out at a time; each is a write, and writes of so many are one or two groups.
 pub const HELLOS_MAX: usize = 512;
-/// Further Hellos that wait on their streams: what a core takes in half of [`HELLO_WAITS`]. The rest are told when to come again, so that a storm of ten
+/// Further Hellos that wait on their streams: what a core carries out in half of [`HELLO_WAITS`], if no robot connects meanwhile. The rest are told when to come again, so that a storm of ten
 /// thousand is over in seconds.
 pub const HELLOS_WAITING_MAX: usize = 2_048;
 /// A Hello waits for room no longer than that, half of what a robot waits for its welcome.
@@ -544,7 +544,7 @@ pub const HELLO_WAITS: LinkDuration = LinkDuration::from_secs(5);
 pub const HELLO_AGAIN: LinkDuration = LinkDuration::from_secs(1);
 /// .. and after this at the latest; the protocol promises robots that nobody is sent away for longer.
 pub const HELLO_AGAIN_MAX: LinkDuration = LinkDuration::from_secs(10);
-/// The next one so much after the one before: what a Hello costs a core, with its handshake.
+/// The next one so much after the one before: what a robot costs a core that connects with a handshake and says hello.
 pub const HELLO_STEP: LinkDuration = LinkDuration(2);
 /// One caller that is denied again and again leaves a row in the audit so often; what lies between is counted in the next row.
 pub const DENIALS_EVERY: LinkDuration = LinkDuration::from_secs(60);

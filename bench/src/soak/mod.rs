@@ -6,9 +6,9 @@ mod samples;
 
 use crate::engine::{Bed, Engine, EngineArgs};
 use crate::figure::Figure;
-use crate::outcome::{RunOutcome, unless_stopped};
 use crate::ota::server::rollouts::Rollouts;
 use crate::ota::server::scene::{Floor, attached};
+use crate::outcome::{RunOutcome, unless_stopped};
 use anyhow::ensure;
 use load::{Released, Submitted};
 use samples::{Sample, Thirds};

@@ -196,9 +196,9 @@ impl Port {
                 (end, Some(Duration::ZERO))
             }
             Reason::Denied(denied) => return self.denied(&peer, denied),
-            // It hears why and is not waited for.
-            Reason::Unused(Unused::NoRequest) => (End::NoRequest, Some(Duration::ZERO)),
-            // A request that it sent before it read this is answered: its peer pauses as long as this port has patience.
+            // A request that it sent before it reads this has a moment; nobody has proven anything here.
+            Reason::Unused(Unused::NoRequest) => (End::NoRequest, Some(std(limits::CONNECTION_LAST))),
+            // A client that calls as often as this port loses patience sends its next request before it reads this, each time: it is answered.
             Reason::Unused(Unused::Idle) => (End::Idle, Some(std(limits::CONNECTION_GRACE))),
             Reason::Old => (End::Old, self.config.age.map(|age| std(age.grace))),
             // Whoever stopped the port counts the time for all.

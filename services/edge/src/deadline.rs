@@ -4,6 +4,7 @@
 //! caller cannot have meant is refused, not ignored.
 
 use crate::answer::Speech;
+use crate::faults::poll_body;
 use crate::peer::Peer;
 use bytes::Bytes;
 use http::HeaderMap;
@@ -113,7 +114,10 @@ impl<H: Unpin> HttpBody for Bounded<H> {
         if this.over.token.is_cancelled() {
             return this.end(&old());
         }
-        let frame = Pin::new(&mut this.body).poll_frame(cx);
+        let frame = match poll_body(|| Pin::new(&mut this.body).poll_frame(cx)) {
+            Ok(frame) => frame,
+            Err(fault) => return this.end(&fault),
+        };
         if frame.is_pending() && this.over.poll(cx) {
             return this.end(&old());
         }
@@ -160,6 +164,26 @@ mod tests {
         let headers = [(http::HeaderName::from_static(GRPC_TIMEOUT), HeaderValue::from_static("soon"))];
         let refused = given(&headers.into_iter().collect()).expect_err("not a time");
         assert_eq!((refused.kind(), refused.violations[0].field.as_str()), (Kind::Invalid, GRPC_TIMEOUT));
+    }
+
+    struct Faulty;
+
+    impl HttpBody for Faulty {
+        type Data = Bytes;
+        type Error = Status;
+        fn poll_frame(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+            panic!("a fault of a service")
+        }
+    }
+
+    #[tokio::test]
+    async fn a_fault_in_the_middle_of_an_answer_is_its_end() {
+        let over = Over { token: CancellationToken::new(), heard: None };
+        let mut body = Bounded::new(Body::new(Faulty), None, over, Speech::Grpc, ());
+        let trailers = body.frame().await.expect("an end").expect("trailers").into_trailers().expect("trailers");
+        let status = Status::from_header_map(&trailers).expect("a status");
+        assert_eq!(status.code(), tonic::Code::Internal);
+        assert!(body.frame().await.is_none(), "and it is not asked again");
     }
 
     /// Always has another byte.

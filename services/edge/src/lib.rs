@@ -19,6 +19,7 @@ mod connection;
 mod deadline;
 mod denials;
 mod descriptor_budget;
+mod faults;
 mod features;
 mod frame_heads;
 mod listen;

@@ -8,13 +8,12 @@ use crate::answer::Speech;
 use crate::config::{Config, std};
 use crate::deadline::{self, Bounded, Over};
 use crate::denials::{self, Denials};
-use crate::features;
 use crate::peer::{Peer, Principals};
 use crate::quota::{Full, Quota, Slot, network};
 use crate::quota_key::QuotaKey;
 use crate::rates::Rates;
 use crate::unauthenticated::Unauthenticated;
-use futures_util::FutureExt;
+use crate::{faults, features};
 use http::{HeaderMap, Request, Response, Uri};
 use hyper::body::Incoming;
 use hyper::service::Service as HyperService;
@@ -27,7 +26,6 @@ use midshift_proto::denials::DenialSink;
 use midshift_proto::{DenialReporter, access};
 use std::convert::Infallible;
 use std::net::IpAddr;
-use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
@@ -277,20 +275,16 @@ impl HyperService<Request<Incoming>> for Door {
         request.extensions_mut().insert(reporter);
         request.extensions_mut().insert(caller);
         let head = deadline.map_or(now + self.rules.head, |deadline| deadline.min(now + self.rules.head));
-        let answer = (self.services)(request.map(Body::new));
-        let port = self.rules.port;
+        let services = self.services.clone();
         Box::pin(async move {
-            // A fault of a service is that call's alone: nothing that calls share here is left half changed by it.
-            let answered = timeout_at(head, AssertUnwindSafe(answer).catch_unwind()).await;
+            let answer = faults::await_answer(async move { services(request.map(Body::new)).await });
+            let answered = timeout_at(head, answer).await;
             let refusal = match answered {
                 Ok(Ok(response)) => {
                     let response = speech.reasoned(response);
                     return Ok(response.map(|body| Bounded::new(body, deadline, over, speech, (stream, Some(slot)))));
                 }
-                Ok(Err(_)) => {
-                    metrics::counter!("midshift_edge_panics_total", "port" => port).increment(1);
-                    Refusal::new(Kind::Internal, Code::Internal)
-                }
+                Ok(Err(fault)) => fault,
                 Err(_) => deadline::over(),
             };
             Ok(speech.refuse(&refusal).map(|body| Bounded::new(body, None, over, speech, (stream, Some(slot)))))

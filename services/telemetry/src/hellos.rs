@@ -51,8 +51,7 @@ impl Hellos {
 }
 
 fn crowded() -> Refusal {
-    let robots = limits::HELLOS_MAX + limits::HELLOS_WAITING_MAX;
-    Refusal::new(Kind::Exhausted, Reason::new(Code::Overloaded, format!("{robots} robots are saying hello")))
+    Refusal::new(Kind::Exhausted, Reason::new(Code::Overloaded, "there is no room for one more hello"))
 }
 
 /// The line of those who were sent away: none of them stands anywhere, each has a moment of its own.
@@ -80,7 +79,8 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn robots_that_are_put_off_together_come_again_one_after_the_other() {
         let (mut turns, now) = (Turns::default(), Instant::now());
-        let (first, step, end) = (limits::HELLO_AGAIN.as_ms(), limits::HELLO_STEP.as_ms(), limits::HELLO_AGAIN_MAX.as_ms());
+        let (first, step, end) =
+            (limits::HELLO_AGAIN.as_ms(), limits::HELLO_STEP.as_ms(), limits::HELLO_AGAIN_MAX.as_ms());
         let line = (end - first) / step + 1;
         for n in 0..line {
             assert_eq!(turns.give_next(now).as_ms(), first + n * step);

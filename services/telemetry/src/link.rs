@@ -83,10 +83,12 @@ impl TelemetryService {
         // Before anything is asked about that robot, or done to a session of it.
         by.is_robot(&hello.robot_id)?;
         welcome::check(&self.inner, &hello)?;
-        let room = self.inner.hellos.enter(self.inner.projection.ready()).await?;
-        if self.inner.moving.is_cancelled() {
-            return Err(Refusal::new(Kind::Unavailable, Code::ShuttingDown));
-        }
+        let room = tokio::select! {
+            // First, so that nobody waits here who had better go elsewhere at once.
+            biased;
+            refusal = self.takes_nobody() => return Err(refusal),
+            room = self.inner.hellos.enter(self.inner.projection.ready()) => room?,
+        };
         // Elsewhere: its state is no session's once it is over.
         let begun = Box::pin(welcome::begin(&self.inner, &hello, by)).await?;
         drop(room);
@@ -105,6 +107,23 @@ impl TelemetryService {
         session::run(self.inner.clone(), &hello, begun, go_away, up, down).await;
         tracing::info!(peer = Empty, %robot_id, session_epoch = epoch, "session ended");
         Ok(())
+    }
+}
+
+impl TelemetryService {
+    /// Resolves when no session is begun here, with why.
+    async fn takes_nobody(&self) -> Refusal {
+        let cut_off = async {
+            let Some(mut cut_off) = self.cut_off() else { return std::future::pending().await };
+            if cut_off.wait_for(|is_cut_off| *is_cut_off).await.is_err() {
+                std::future::pending().await
+            }
+        };
+        tokio::select! {
+            () = self.inner.moving.cancelled() => Refusal::new(Kind::Unavailable, Code::ShuttingDown),
+            () = self.inner.shutdown.cancelled() => Refusal::new(Kind::Unavailable, Code::ShuttingDown),
+            () = cut_off => welcome::cut_off(),
+        }
     }
 }
 

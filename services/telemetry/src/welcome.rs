@@ -58,15 +58,20 @@ fn unavailable(error: impl std::fmt::Display) -> Refusal {
     Refusal::new(Kind::Unavailable, Reason::new(Code::StoreUnavailable, error.to_string()))
 }
 
+/// Nobody is admitted without the database that gateways share.
+pub fn cut_off() -> Refusal {
+    unavailable("this gateway has lost the database")
+}
+
 /// Admits the session, in charge or observed.
 pub async fn begin(inner: &Inner, hello: &Hello, by: &Caller) -> Result<Begun, Refusal> {
     let store = inner.parts.store.as_ref();
     // Asking a database that is away takes time that the robot's authority has not.
     if inner.shared.as_ref().is_some_and(|shared| *shared.cut_off().borrow()) {
-        return Err(unavailable("this gateway has lost the database"));
+        return Err(cut_off());
     }
     for _ in 0..TRIES {
-        let Known { row, mark, robot } = read_known(store, hello).await.map_err(unavailable)?;
+        let Known { row, mark, robot } = read_known(store, hello, by).await.map_err(unavailable)?;
         let status = status_of(inner, hello).await?;
         // A secret lies in a file and can be copied with it: of another start it proves nothing while the older session is heard.
         let proven = row.as_ref().is_some_and(|(row, _)| {
@@ -133,14 +138,16 @@ struct Known {
     row: Option<(Session, Revision)>,
     /// Durable numbers of its ring.
     mark: (LaneMark, Revision),
-    /// Its enrolment.
+    /// Its enrolment; none without a login.
     robot: Option<RobotIdentity>,
 }
 
-async fn read_known(store: &dyn Store, hello: &Hello) -> Result<Known, Error> {
+async fn read_known(store: &dyn Store, hello: &Hello, by: &Caller) -> Result<Known, Error> {
     let fresh = LaneMark::fresh(hello.robot_id.clone(), &hello.ring);
-    let keys = [Session::TABLE, RobotIdentity::TABLE].map(|table| Key::new(table, hello.robot_id.as_str()));
-    let rows = store.get(keys.into_iter().chain([Key::new(LaneMark::TABLE, &*fresh.id())]).collect()).await?;
+    let robot_id = hello.robot_id.as_str();
+    let mut keys = vec![Key::new(Session::TABLE, robot_id), Key::new(LaneMark::TABLE, &*fresh.id())];
+    keys.extend(by.key().map(|_| Key::new(RobotIdentity::TABLE, robot_id)));
+    let rows = store.get(keys).await?;
     let mark = find_record(&rows)?.unwrap_or((fresh, Revision(0)));
     Ok(Known { row: find_record(&rows)?, mark, robot: find_record(&rows)?.map(|(robot, _)| robot) })
 }

@@ -267,5 +267,5 @@ async fn a_fault_of_a_service_ends_the_call_that_met_it_and_nothing_else_on_its_
     }
     client.asked("/poke").await;
     assert!(within(session.into_body().data()).await.expect("a word").is_ok());
-    assert_eq!((world.counter("midshift_edge_panics_total", ("port", "business")), world.requests_open()), (3, 1));
+    assert_eq!((world.counter("midshift_edge_panics_total", ("at", "call")), world.requests_open()), (3, 1));
 }

@@ -9,7 +9,7 @@ use crate::gather::Gathered;
 use crate::queue::unavailable;
 use crate::sql::{self, ENTRY_READ, entry, row};
 use crate::store::{Wanted, page_of};
-use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, Query, Snapshot};
+use crate::{Cursor, Error, FEED_PAGE_MAX, FeedPage, GET_KEYS_MAX, Query, Snapshot};
 use midshift_core::ids::SiteId;
 use midshift_core::rows::{Entry, Key, Log, Naming, Row, RowSelection, Seq, Table};
 use sqlx::sqlite::{SqliteArguments, SqliteRow};
@@ -123,7 +123,9 @@ pub(super) async fn read(
         if missing.is_empty() && is_whole {
             return Ok(gathered.at(seq));
         }
-        gathered.add(rows_by_ids(&mut *transaction, site_id, &missing).await?);
+        for some in missing.chunks(GET_KEYS_MAX) {
+            gathered.add(rows_by_ids(&mut *transaction, site_id, some).await?);
+        }
     }
 }
 

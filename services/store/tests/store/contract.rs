@@ -477,6 +477,15 @@ async fn a_row_reads_back_as_written_in_every_table(store: Arc<dyn Store>) {
     let keys = snapshot.rows.iter().rev().map(|row| row.key.clone()).collect();
     let got = store.get(keys).await.unwrap();
     assert!(got.iter().eq(snapshot.rows.iter().rev()), "in the order asked for");
+    let odd = ["a\"b", "a\\u0041", "\u{1}\u{7f}", "\u{1f916}", "007", "null", "[1]"];
+    for id in odd {
+        one(&*store, Writer::Fleet, vec![put(Table::Attempt, id, Expect::Absent, "{}")]).await.unwrap();
+    }
+    let keys = || odd.iter().chain(["7", "aA"].iter()).chain(&odd[..2]).map(|id| Key::new(Table::Attempt, *id));
+    let got = store.get(keys().chain([Key::new(Table::TaskState, "it's")]).collect()).await.unwrap();
+    let ids: Vec<&str> = got.iter().map(|row| &*row.key.id).collect();
+    let wanted: Vec<&str> = odd.iter().chain(&odd[..2]).copied().chain(["it's"]).collect();
+    assert_eq!(ids, wanted, "each as often as it was asked for, and none that is only written alike");
 }
 
 async fn entries_say_who_did_what_and_on_whose_request(store: Arc<dyn Store>) {

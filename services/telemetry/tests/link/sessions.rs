@@ -203,7 +203,27 @@ async fn of_a_storm_of_robots_some_are_put_off_with_a_time_and_all_come_in() -> 
         welcome += 1;
     }
     assert_eq!(welcome, limits::HELLOS_WAITING_MAX);
-    assert!(attach(limits::HELLOS_WAITING_MAX + 1).await?.await.is_ok(), "there is room again, and nothing was restarted");
+    assert!(
+        attach(limits::HELLOS_WAITING_MAX + 1).await?.await.is_ok(),
+        "there is room again, and nothing was restarted"
+    );
+    Ok(())
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_hello_that_waits_is_sent_elsewhere_as_soon_as_its_gateway_takes_nobody_more() -> Result<()> {
+    let world = crate::world::world_after(std::future::pending()).await?;
+    let begin = tokio::time::Instant::now();
+    let waits = Robot::attach(&world, None);
+    let leaves = async {
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        world.service.move_over().await;
+    };
+    let (refused, ()) = tokio::join!(waits, leaves);
+    let refused = refused.err().ok_or("a welcome of a gateway that takes nobody")?;
+    let refused = refused.downcast_ref::<tonic::Status>().ok_or("no status")?;
+    assert_eq!(midshift_proto::refusal_of(refused).code, Some(Code::ShuttingDown));
+    assert!(begin.elapsed() < Duration::from_secs(1), "{:?}", begin.elapsed());
     Ok(())
 }
 
