@@ -100,10 +100,10 @@ mod tests {
         let started = Instant::now();
         let (entered, ()) = tokio::join!(hellos.enter(std::future::ready(())), async { drop(inside.pop()) });
         assert!(entered.is_ok());
-        let refused = hellos.enter(std::future::ready(())).await.err().expect("no room in time");
+        let refused = hellos.enter(std::future::ready(())).await.expect_err("no room in time");
         assert_eq!((refused.kind(), refused.reason.code), (Kind::Exhausted, Code::Overloaded));
         assert_eq!(started.elapsed().as_millis() as u64, limits::HELLO_WAITS.as_ms());
-        let refused = Hellos::default().enter(std::future::pending()).await.err().expect("never ready");
+        let refused = Hellos::default().enter(std::future::pending()).await.expect_err("never ready");
         assert_eq!((refused.kind(), refused.reason.code), (Kind::Unavailable, Code::StoreUnavailable));
         assert_eq!(refused.again_after.map(LinkDuration::as_ms), Some(limits::HELLO_AGAIN.as_ms()));
     }
