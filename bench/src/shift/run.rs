@@ -1,0 +1,134 @@
+//! One shift from its first heartbeat to its end: opens everything on a runtime whose time is paused, and watches.
+//!
+//! Real are intake, telemetry's sessions, fleet's reconciler and planner, the agents' cores, and the bodies. The store is
+//! the model. Stood in for are the transport, the shell of an agent and its disk. Invariant: one thread, one time, one
+//! seed; nothing reads the wall but what measures it.
+
+use super::clock::VirtualClock;
+use super::control_plane::ControlPlane;
+use super::floor::Floor;
+use super::plan_log::PlansNoted;
+use super::progress::ProgressWatch;
+use super::robot::Robot;
+use super::task_records::{TaskCounts, TaskRecord, TaskRecords};
+use super::workload::{Client, Demand};
+use midshift_core::time::Clock;
+use midshift_sim::faults::FaultRates;
+use midshift_sim::fleet::{Fleet, FleetConfig, FleetReport};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// The fleet is looked at this often.
+const LOOK: Duration = Duration::from_secs(10);
+/// Robots are switched on one after the other, so far apart.
+const SWITCHED_ON: Duration = Duration::from_millis(13);
+/// Work begins once every robot has had so long.
+const WORK_BEGINS: Duration = Duration::from_secs(3);
+
+/// What one shift is.
+#[derive(Clone)]
+pub struct ShiftConfig {
+    /// Where it is.
+    pub floor: Arc<Floor>,
+    /// How many robots.
+    pub robots: usize,
+    /// How long it lasts.
+    pub lasts: Duration,
+    /// Decides all that is drawn.
+    pub seed: u64,
+    /// Time that a message takes between a robot and the server, each way.
+    pub delay: Duration,
+    /// What is asked for.
+    pub demand: Demand,
+}
+
+/// The fleet at one moment.
+#[derive(Clone, Copy, Debug)]
+pub struct Sample {
+    /// Since the beginning, milliseconds.
+    pub at_ms: u64,
+    /// Tasks at that moment.
+    pub counts: TaskCounts,
+}
+
+/// What came of a shift.
+pub struct Outcome {
+    /// Robots that there were.
+    pub robots: usize,
+    /// How long it lasted, milliseconds.
+    pub lasted_ms: u64,
+    /// Every task.
+    pub tasks: Vec<TaskRecord>,
+    /// Tasks at the end.
+    pub counts: TaskCounts,
+    /// What was planned.
+    pub plans: PlansNoted,
+    /// What the bodies did, and whether they broke a rule.
+    pub bodies: FleetReport,
+    /// Robots with a task that came on with nothing, summed up.
+    pub no_progress: Duration,
+    /// The fleet over time.
+    pub samples: Vec<Sample>,
+    /// Time that the run took by the wall.
+    pub wall: Duration,
+}
+
+/// Runs one shift.
+///
+/// # Errors
+/// A task that is refused, a fleet that the site has no room for, or a store that cannot be read.
+pub fn run(config: &ShiftConfig) -> anyhow::Result<Outcome> {
+    let begun = wall();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build()?;
+    let outcome = runtime.block_on(play(config))?;
+    // Robots and services run for ever: they are dropped where they are.
+    runtime.shutdown_background();
+    Ok(Outcome { wall: begun.elapsed(), ..outcome })
+}
+
+#[expect(clippy::disallowed_methods, reason = "how long a run takes is real time")]
+fn wall() -> Instant {
+    Instant::now()
+}
+
+async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
+    let (floor, clock, records) = (&config.floor, VirtualClock::begin(), Arc::new(TaskRecords::default()));
+    let plane = ControlPlane::open(floor.site.clone(), floor.text.clone(), clock.clone(), records.clone()).await?;
+    let faults = FaultRates::none();
+    let of_fleet =
+        FleetConfig { faults, drains: false, ..FleetConfig::new(floor.site.clone(), config.robots, config.seed) };
+    let fleet = Arc::new(Fleet::open(&of_fleet, &clock.now())?);
+    for (number, body) in (0..).zip(fleet.robots()) {
+        let robot = Robot::new(body.clone(), clock.clone(), plane.telemetry.clone(), config.delay);
+        tokio::spawn(robot.run(SWITCHED_ON * number));
+    }
+    tokio::time::sleep(WORK_BEGINS + SWITCHED_ON * config.robots as u32).await;
+    let source = floor.tasks(config.seed)?;
+    let client = Client::new(plane.tasks.clone(), source, records.clone(), clock.clone(), config.seed);
+    let asking = client.run(config.demand, config.robots);
+    tokio::pin!(asking);
+    let mut progress = ProgressWatch::new(fleet.clone(), records.clone());
+    let mut samples = Vec::new();
+    let lasts_ms = config.lasts.as_millis() as u64;
+    while clock.elapsed_ms() < lasts_ms {
+        tokio::select! {
+            biased;
+            ended = &mut asking => ended?,
+            () = tokio::time::sleep(LOOK) => {
+                samples.push(Sample { at_ms: clock.elapsed_ms(), counts: records.counts() });
+                progress.look(clock.now().site);
+            }
+        }
+    }
+    Ok(Outcome {
+        robots: config.robots,
+        lasted_ms: clock.elapsed_ms(),
+        tasks: records.tasks(),
+        counts: records.counts(),
+        plans: plane.plan_log.plans(),
+        bodies: fleet.report(clock.now().site)?,
+        no_progress: progress.no_progress(),
+        samples,
+        wall: Duration::ZERO,
+    })
+}
