@@ -3,6 +3,9 @@
 use super::run::Outcome;
 use super::task_records::{TaskRecord, Urgency};
 use crate::figure::{Figure, percentile};
+use midshift_core::site::grid;
+use std::ops::Range;
+use std::time::Duration;
 
 /// What is told of one shift, each by its name and unit.
 pub type Measures = Vec<(&'static str, &'static str, f64)>;
@@ -35,6 +38,7 @@ pub fn measures(outcome: &Outcome) -> Measures {
     let urgent_waits = seconds(urgent);
     let bodies = &outcome.bodies;
     let robots_ms = (outcome.robots as u64 * outcome.lasted_ms).max(1) as f64;
+    let share = |ms: u64| 100.0 * ms as f64 / robots_ms;
     let assigned = outcome.tasks.iter().filter(|t| t.assignments > 0);
     let (assigned, assignments) = assigned.fold((0_u64, 0_u64), |(n, sum), t| (n + 1, sum + u64::from(t.assignments)));
     let done_mm: u64 = outcome.tasks.iter().filter(|t| t.done_ms.is_some()).map(|t| t.way_mm).sum();
@@ -46,9 +50,11 @@ pub fn measures(outcome: &Outcome) -> Measures {
         ("wait for a robot, p50", "s", percentile(&waits, 0.5)),
         ("wait for a robot, p95", "s", percentile(&waits, 0.95)),
         ("wait for a robot, longest", "s", percentile(&waits, 1.0)),
-        ("utilisation", "%", 100.0 * (1.0 - bodies.counts.idle_ms as f64 / robots_ms)),
-        ("driving", "%", 100.0 * bodies.counts.driving_ms as f64 / robots_ms),
-        ("acting", "%", 100.0 * bodies.counts.acting_ms as f64 / robots_ms),
+        ("utilisation", "%", 100.0 - share(bodies.counts.idle_ms)),
+        ("driving", "%", share(bodies.counts.driving_ms)),
+        ("acting", "%", share(bodies.counts.acting_ms)),
+        ("standing with a task", "%", share(bodies.counts.halted_ms + bodies.counts.blocked_ms)),
+        ("driving at the speed of a grid", "%", share(bodies.path_mm * 1_000 / u64::from(grid::SPEED_MM_S))),
         ("re-assignments a task", "1", assignments.saturating_sub(assigned) as f64 / assigned.max(1) as f64),
         ("tasks that failed", "1", outcome.counts.failed as f64),
         ("tasks that ended twice", "1", outcome.counts.ended_twice as f64),
@@ -61,11 +67,24 @@ pub fn measures(outcome: &Outcome) -> Measures {
         ("plan by the wall, p99", "ms", percentile(&outcome.plans.plan_ms, 0.99)),
         ("run by the wall", "s", outcome.wall.as_secs_f64()),
     ];
+    if let Some(stop) = &outcome.planner_stop {
+        measures.push(("backlog of the stop stays", "min", backlog_stays_ms(outcome, stop) as f64 / 60_000.0));
+    }
     if !urgent_waits.is_empty() {
         measures.push(("urgent wait for a robot, p50", "s", percentile(&urgent_waits, 0.5)));
         measures.push(("urgent wait for a robot, p95", "s", percentile(&urgent_waits, 0.95)));
     }
     measures
+}
+
+/// How long after the planner's return more tasks are open than when it stopped; to the end of the shift if for ever.
+fn backlog_stays_ms(outcome: &Outcome, stop: &Range<Duration>) -> u64 {
+    let (begins_ms, ends_ms) = (stop.start.as_millis() as u64, stop.end.as_millis() as u64);
+    let before = outcome.samples.iter().take_while(|sample| sample.at_ms <= begins_ms).last();
+    let open = before.map_or(0, |sample| sample.counts.open);
+    let mut after = outcome.samples.iter().filter(|sample| sample.at_ms >= ends_ms);
+    let gone = after.find(|sample| sample.counts.open <= open);
+    gone.map_or(outcome.lasted_ms, |sample| sample.at_ms).saturating_sub(ends_ms)
 }
 
 /// Figures over the seeds of one policy and workload. A reference stands beside the tasks in an hour.

@@ -1,8 +1,9 @@
 //! P7: a whole shift of a site in virtual time, in one process: what a policy gets out of a fleet under a workload.
 //!
 //! Modules, from the lowest to the highest: `clock`, `task_records`, `plan_log`, `link`, `robot`, `control_plane`, `floor`,
-//! `workload`, `progress`, `run`, `measures`. What is real and what is stood in for stands in `run`.
+//! `workload`, `scenario`, `progress`, `run`, `measures`, `chart`. What is real and what is stood in for stands in `run`.
 
+mod chart;
 mod clock;
 mod control_plane;
 mod floor;
@@ -12,16 +13,19 @@ mod plan_log;
 mod progress;
 mod robot;
 mod run;
+mod scenario;
 mod task_records;
 mod workload;
 
 use crate::figure::Figure;
+use chart::Course;
 use floor::{Floor, TaskForm};
-use run::ShiftConfig;
+use plan_log::PlansNoted;
+use run::{Outcome, ShiftConfig};
+use scenario::{Scenario, Workload};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
-use workload::{Arrivals, Demand};
 
 /// A planner's policy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -62,9 +66,21 @@ pub struct ShiftArgs {
     /// Runs, each with the next seed from 1.
     #[arg(long, default_value_t = 1)]
     seeds: u64,
+    /// What is asked of the fleet.
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "w2")]
+    workload: Vec<Workload>,
+    /// Half an hour and two seeds.
+    #[arg(long, conflicts_with_all = ["hours", "seeds"])]
+    quick: bool,
+    /// Also draw throughput and queue over time into this file.
+    #[arg(long)]
+    svg: Option<PathBuf>,
     /// Milliseconds that a message takes between a robot and the server.
     #[arg(long, default_value_t = 2)]
     link_ms: u64,
+    /// Milliseconds between two heartbeats, at least 100; without it as the server says.
+    #[arg(long)]
+    heartbeat_ms: Option<u64>,
     /// Tasks visit their two places and handle nothing there.
     #[arg(long)]
     visits: bool,
@@ -73,29 +89,77 @@ pub struct ShiftArgs {
     reference_per_hour: Option<f64>,
 }
 
+/// The saturated rate is measured over at most so long.
+const SATURATED: Duration = Duration::from_secs(2 * 3_600);
+/// What `--quick` runs: hours of virtual time, and seeds.
+const QUICK: (f64, u64) = (0.5, 2);
+
+impl ShiftArgs {
+    fn lasts(&self) -> Duration {
+        Duration::from_secs_f64(if self.quick { QUICK.0 } else { self.hours } * 3_600.0)
+    }
+
+    fn seeds(&self) -> u64 {
+        if self.quick { QUICK.1 } else { self.seeds }
+    }
+
+    fn config(&self, floor: &Arc<Floor>, seed: u64, scenario: Scenario) -> ShiftConfig {
+        ShiftConfig {
+            floor: floor.clone(),
+            robots: self.robots,
+            lasts: self.lasts(),
+            seed,
+            delay: Duration::from_millis(self.link_ms),
+            heartbeat: self.heartbeat_ms.map(Duration::from_millis),
+            scenario,
+        }
+    }
+}
+
 /// Runs every policy under every workload, once for each seed.
 pub fn run(args: &ShiftArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> {
     let form = if args.visits { TaskForm::Visits } else { TaskForm::Listed };
     let (site, map, tasks) = (args.site.as_deref(), args.map.as_deref(), args.tasks.as_deref());
     let floor = Arc::new(Floor::read(site, map, tasks, args.robots, form)?);
-    let mut figures = Vec::new();
+    let seeds: Vec<u64> = (1..=args.seeds()).collect();
+    let saturated = saturated_rates(args, &floor, &seeds)?;
+    let (mut figures, mut courses) = (Vec::new(), Vec::new());
     for policy in &args.policy {
-        let mut told = Vec::new();
-        for seed in 1..=args.seeds {
-            let config = ShiftConfig {
-                floor: floor.clone(),
-                robots: args.robots,
-                lasts: Duration::from_secs_f64(args.hours * 3_600.0),
-                seed,
-                delay: Duration::from_millis(args.link_ms),
-                demand: Demand { arrivals: Arrivals::Saturated, urgent_permille: 0 },
-            };
-            let outcome = run::run(&config)?;
-            let hash = outcome.plans.hash;
-            say(&format!("{} W2 seed {seed}: plans {hash:016x}, {} items", policy.name(), outcome.plans.items));
-            told.push(measures::measures(&outcome));
+        for workload in &args.workload {
+            for nth in 0..workload.scenarios(0.0, args.lasts()).len() {
+                let mut outcomes = Vec::new();
+                for (seed, per_hour) in seeds.iter().zip(&saturated) {
+                    let scenario = workload.scenarios(*per_hour, args.lasts()).swap_remove(nth);
+                    let title = format!("{} {}", policy.name(), scenario.name);
+                    let outcome = run::run(&args.config(&floor, *seed, scenario))?;
+                    let PlansNoted { hash, items, .. } = outcome.plans;
+                    say(&format!("{title}, seed {seed}: plans {hash:016x}, {items} items"));
+                    outcomes.push((title, outcome));
+                }
+                let title = outcomes.first().map(|(title, _)| title.clone()).unwrap_or_default();
+                let outcomes: Vec<Outcome> = outcomes.into_iter().map(|(_, outcome)| outcome).collect();
+                let told: Vec<_> = outcomes.iter().map(measures::measures).collect();
+                figures.extend(measures::figures(&title, &told, args.reference_per_hour));
+                courses.push(Course::new(title, &outcomes));
+            }
         }
-        figures.extend(measures::figures(&format!("{} W2", policy.name()), &told, args.reference_per_hour));
+    }
+    if let Some(path) = &args.svg {
+        std::fs::write(path, chart::draw(&courses))?;
     }
     Ok(figures)
+}
+
+/// Tasks in an hour of `fifo-nearest` with always enough of them, by seed: what loads are multiples of. None needs it: zeros.
+fn saturated_rates(args: &ShiftArgs, floor: &Arc<Floor>, seeds: &[u64]) -> anyhow::Result<Vec<f64>> {
+    if !args.workload.iter().any(|workload| workload.needs_saturated_rate()) {
+        return Ok(vec![0.0; seeds.len()]);
+    }
+    let rate = |seed: &u64| {
+        let scenario = Workload::W2.scenarios(0.0, args.lasts()).swap_remove(0);
+        let mut config = args.config(floor, *seed, scenario);
+        config.lasts = config.lasts.min(SATURATED);
+        Ok(measures::tasks_per_hour(&run::run(&config)?))
+    };
+    seeds.iter().map(rate).collect()
 }

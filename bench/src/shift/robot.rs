@@ -21,25 +21,33 @@ use tokio_stream::StreamExt;
 /// A session that was refused or has ended is opened again after this.
 const RETRY: Duration = Duration::from_millis(500);
 
+/// What the ways between a robot and the server are like.
+#[derive(Clone, Copy, Debug)]
+pub struct RobotConfig {
+    /// Time that a message takes, each way.
+    pub delay: Duration,
+    /// Pause between two heartbeats; none: as the server says.
+    pub heartbeat: Option<Duration>,
+}
+
 /// A robot.
 pub struct Robot {
     core: AgentCore,
     body: SimHandle,
     clock: Arc<VirtualClock>,
     telemetry: TelemetryService,
-    /// Time that a message takes on its way, each way.
-    delay: Duration,
+    config: RobotConfig,
     link: Option<RobotLink>,
 }
 
 impl Robot {
     /// A robot that begins with nothing kept, around this body.
-    pub fn new(body: SimHandle, clock: Arc<VirtualClock>, telemetry: TelemetryService, delay: Duration) -> Self {
+    pub fn new(body: SimHandle, clock: Arc<VirtualClock>, telemetry: TelemetryService, config: RobotConfig) -> Self {
         let robot_id = body.robot_id().clone();
         let memory = MemoryStore::new().load_now(&format!("ring-{robot_id}"));
-        let config = CoreConfig { robot_id, bugs: Default::default(), update: None, server_is_proven: false };
-        let core = AgentCore::new(config, Box::new(body.clone()), memory, clock.now());
-        Self { core, body, clock, telemetry, delay, link: None }
+        let of_core = CoreConfig { robot_id, bugs: Default::default(), update: None, server_is_proven: false };
+        let core = AgentCore::new(of_core, Box::new(body.clone()), memory, clock.now());
+        Self { core, body, clock, telemetry, config, link: None }
     }
 
     /// Lives until it is dropped, `after` the beginning: robots of a fleet are not switched on in the same moment.
@@ -63,7 +71,7 @@ impl Robot {
 
     async fn attach(&mut self) {
         let hello = self.hello();
-        self.link = RobotLink::open(&self.telemetry, hello, self.delay).await.ok();
+        self.link = RobotLink::open(&self.telemetry, hello, self.config.delay).await.ok();
     }
 
     /// Hears the next message, or does what is due.
@@ -103,7 +111,12 @@ impl Robot {
 
     fn receive(&mut self, message: SessionResponse) {
         match midshift_proto::parse(message) {
-            Ok(ToRobot::Welcome(welcome)) => self.step(Input::Connected(welcome)),
+            Ok(ToRobot::Welcome(mut welcome)) => {
+                if let Some(period) = self.config.heartbeat {
+                    welcome.heartbeat_period_ms = period.as_millis() as u32;
+                }
+                self.step(Input::Connected(welcome));
+            }
             Ok(ToRobot::Downlink(down)) => self.step(Input::Down(down)),
             Ok(ToRobot::MoveOver { .. }) => {}
             Ok(ToRobot::Close(_)) | Err(_) => self.link = None,

@@ -9,17 +9,20 @@ use super::control_plane::ControlPlane;
 use super::floor::Floor;
 use super::plan_log::PlansNoted;
 use super::progress::ProgressWatch;
-use super::robot::Robot;
+use super::robot::{Robot, RobotConfig};
+use super::scenario::{BodyFaults, Scenario};
 use super::task_records::{TaskCounts, TaskRecord, TaskRecords};
-use super::workload::{Client, Demand};
+use super::workload::Client;
+use midshift_core::ids::TaskId;
 use midshift_core::time::Clock;
 use midshift_sim::faults::FaultRates;
 use midshift_sim::fleet::{Fleet, FleetConfig, FleetReport};
+use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// The fleet is looked at this often.
-const LOOK: Duration = Duration::from_secs(10);
+/// The fleet is looked at this often, and the person who looks after broken robots goes round.
+const LOOK: Duration = Duration::from_secs(5);
 /// Robots are switched on one after the other, so far apart.
 const SWITCHED_ON: Duration = Duration::from_millis(13);
 /// Work begins once every robot has had so long.
@@ -38,8 +41,10 @@ pub struct ShiftConfig {
     pub seed: u64,
     /// Time that a message takes between a robot and the server, each way.
     pub delay: Duration,
-    /// What is asked for.
-    pub demand: Demand,
+    /// Pause between two heartbeats; none: as the server says.
+    pub heartbeat: Option<Duration>,
+    /// What is asked for, and what goes wrong.
+    pub scenario: Scenario,
 }
 
 /// The fleet at one moment.
@@ -69,6 +74,8 @@ pub struct Outcome {
     pub no_progress: Duration,
     /// The fleet over time.
     pub samples: Vec<Sample>,
+    /// When the planner was away.
+    pub planner_stop: Option<Range<Duration>>,
     /// Time that the run took by the wall.
     pub wall: Duration,
 }
@@ -93,19 +100,17 @@ fn wall() -> Instant {
 
 async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     let (floor, clock, records) = (&config.floor, VirtualClock::begin(), Arc::new(TaskRecords::default()));
-    let plane = ControlPlane::open(floor.site.clone(), floor.text.clone(), clock.clone(), records.clone()).await?;
-    let faults = FaultRates::none();
-    let of_fleet =
-        FleetConfig { faults, drains: false, ..FleetConfig::new(floor.site.clone(), config.robots, config.seed) };
-    let fleet = Arc::new(Fleet::open(&of_fleet, &clock.now())?);
+    let mut plane = ControlPlane::open(floor.site.clone(), floor.text.clone(), clock.clone(), records.clone()).await?;
+    let fleet = Arc::new(open_fleet(config, &clock)?);
     for (number, body) in (0..).zip(fleet.robots()) {
-        let robot = Robot::new(body.clone(), clock.clone(), plane.telemetry.clone(), config.delay);
+        let (telemetry, heartbeat) = (plane.telemetry.clone(), config.heartbeat);
+        let robot = Robot::new(body.clone(), clock.clone(), telemetry, RobotConfig { delay: config.delay, heartbeat });
         tokio::spawn(robot.run(SWITCHED_ON * number));
     }
     tokio::time::sleep(WORK_BEGINS + SWITCHED_ON * config.robots as u32).await;
     let source = floor.tasks(config.seed)?;
     let client = Client::new(plane.tasks.clone(), source, records.clone(), clock.clone(), config.seed);
-    let asking = client.run(config.demand, config.robots);
+    let asking = client.run(config.scenario.demand, config.robots);
     tokio::pin!(asking);
     let mut progress = ProgressWatch::new(fleet.clone(), records.clone());
     let mut samples = Vec::new();
@@ -115,8 +120,16 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
             biased;
             ended = &mut asking => ended?,
             () = tokio::time::sleep(LOOK) => {
+                let now = clock.now().site;
                 samples.push(Sample { at_ms: clock.elapsed_ms(), counts: records.counts() });
-                progress.look(clock.now().site);
+                progress.look(now);
+                if config.scenario.faults == BodyFaults::Usual {
+                    fleet.person_round(now, &|task_id: &TaskId| records.is_worked_on(task_id));
+                }
+                if let Some(stop) = &config.scenario.planner_stop {
+                    let is_away = stop.contains(&Duration::from_millis(clock.elapsed_ms()));
+                    if is_away { plane.stop_planner().await } else { plane.start_planner() }
+                }
             }
         }
     }
@@ -129,6 +142,17 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
         bodies: fleet.report(clock.now().site)?,
         no_progress: progress.no_progress(),
         samples,
+        planner_stop: config.scenario.planner_stop.clone(),
         wall: Duration::ZERO,
     })
+}
+
+/// Bodies whose batteries do not empty: no floor of this bench has chargers for them.
+fn open_fleet(config: &ShiftConfig, clock: &VirtualClock) -> anyhow::Result<Fleet> {
+    let faults = match config.scenario.faults {
+        BodyFaults::None => FaultRates::none(),
+        BodyFaults::Usual => FaultRates::default(),
+    };
+    let of_site = FleetConfig::new(config.floor.site.clone(), config.robots, config.seed);
+    Ok(Fleet::open(&FleetConfig { faults, drains: false, ..of_site }, &clock.now())?)
 }

@@ -140,6 +140,12 @@ impl TaskRecords {
         self.lock().busy.clone()
     }
 
+    /// Whether a task has not ended, and waits for no person.
+    pub fn is_worked_on(&self, task_id: &TaskId) -> bool {
+        let over = |phase: Phase| phase.is_terminal() || phase == Phase::NeedsOperator;
+        self.lock().tasks.get(task_id).is_some_and(|task| !over(task.phase))
+    }
+
     /// Every task, in the order of its id.
     pub fn tasks(&self) -> Vec<TaskRecord> {
         self.lock().tasks.values().cloned().collect()
