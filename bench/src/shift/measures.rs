@@ -41,10 +41,12 @@ pub fn measures(outcome: &Outcome) -> Measures {
     let share = |ms: u64| 100.0 * ms as f64 / robots_ms;
     let assigned = outcome.tasks.iter().filter(|t| t.assignments > 0);
     let (assigned, assignments) = assigned.fold((0_u64, 0_u64), |(n, sum), t| (n + 1, sum + u64::from(t.assignments)));
-    let done_mm: u64 = outcome.tasks.iter().filter(|t| t.done_ms.is_some()).map(|t| t.way_mm).sum();
+    // Visits carry nothing: then the ways that tasks asked for count.
+    let asked_mm = outcome.tasks.iter().filter(|t| t.done_ms.is_some()).map(|t| t.way_mm).sum();
+    let loaded_mm: u64 = if bodies.loaded_path_mm > 0 { bodies.loaded_path_mm } else { asked_mm };
     let mut measures = vec![
         ("tasks", "1/h", tasks_per_hour(outcome)),
-        ("empty travel", "%", 100.0 * (1.0 - done_mm as f64 / bodies.path_mm.max(1) as f64)),
+        ("empty travel", "%", 100.0 * (1.0 - loaded_mm as f64 / bodies.path_mm.max(1) as f64)),
         ("completion, p50", "s", percentile(&completion, 0.5)),
         ("completion, p95", "s", percentile(&completion, 0.95)),
         ("wait for a robot, p50", "s", percentile(&waits, 0.5)),

@@ -84,6 +84,9 @@ pub struct ShiftArgs {
     /// Tasks visit their two places and handle nothing there.
     #[arg(long)]
     visits: bool,
+    /// Bodies face their way at once, and do not turn on the spot.
+    #[arg(long)]
+    no_turns: bool,
     /// Tasks in an hour of a reference, to stand beside the saturated rate.
     #[arg(long)]
     reference_per_hour: Option<f64>,
@@ -111,6 +114,7 @@ impl ShiftArgs {
             seed,
             delay: Duration::from_millis(self.link_ms),
             heartbeat: self.heartbeat_ms.map(Duration::from_millis),
+            turns: !self.no_turns,
             scenario,
         }
     }

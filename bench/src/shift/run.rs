@@ -43,6 +43,8 @@ pub struct ShiftConfig {
     pub delay: Duration,
     /// Pause between two heartbeats; none: as the server says.
     pub heartbeat: Option<Duration>,
+    /// Turning on the spot takes a body time.
+    pub turns: bool,
     /// What is asked for, and what goes wrong.
     pub scenario: Scenario,
 }
@@ -154,5 +156,5 @@ fn open_fleet(config: &ShiftConfig, clock: &VirtualClock) -> anyhow::Result<Flee
         BodyFaults::Usual => FaultRates::default(),
     };
     let of_site = FleetConfig::new(config.floor.site.clone(), config.robots, config.seed);
-    Ok(Fleet::open(&FleetConfig { faults, drains: false, ..of_site }, &clock.now())?)
+    Ok(Fleet::open(&FleetConfig { faults, drains: false, turns: config.turns, ..of_site }, &clock.now())?)
 }

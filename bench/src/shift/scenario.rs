@@ -20,7 +20,8 @@ pub enum Workload {
     W3,
     /// Steady at 95 % of the saturated rate; one task in ten is urgent.
     W4,
-    /// Steady at 110 % of the saturated rate, with faults of bodies, and a planner that stops for ten minutes.
+    /// Steady at 110 % of the saturated rate, with faults of bodies, and a planner that stops for ten minutes, or for a
+    /// twelfth of a shift of less than two hours.
     W6,
 }
 
