@@ -13,6 +13,7 @@ use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
 use midshift_task::TaskService;
 use midshift_telemetry::TelemetryService;
 use std::sync::Arc;
+use std::time::Duration;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
@@ -45,7 +46,7 @@ pub struct ControlPlane {
 }
 
 impl ControlPlane {
-    /// Opens a site with an empty store and starts everything.
+    /// Opens a site with an empty store and starts everything. Each turn of the planner takes `turn`.
     ///
     /// # Errors
     /// If the store cannot be read.
@@ -54,13 +55,14 @@ impl ControlPlane {
         site_text: String,
         clock: Arc<VirtualClock>,
         records: Arc<TaskRecords>,
+        turn: Duration,
     ) -> anyhow::Result<Self> {
         let store_id = StoreId(Arc::from("shift"));
         let any_clock: Arc<dyn Clock> = clock.clone();
         let model = MemoryStore::new(site.site_id().clone(), store_id, any_clock.clone());
         let model = Arc::new(model.with_log_entries_max(LOG_ENTRIES));
         let store: Arc<dyn Store> = model.clone();
-        let plan_log = Arc::new(PlanLog::new(model, clock.clone(), records));
+        let plan_log = Arc::new(PlanLog::new(model, clock.clone(), records, turn));
         let board = LiveBoard::new();
         let parts = midshift_telemetry::Parts {
             store: store.clone(),

@@ -1,7 +1,17 @@
 //! P7: a whole shift of a site in virtual time, in one process: what a policy gets out of a fleet under a workload.
 //!
+//! Real are the intake of tasks, telemetry with its sessions, fleet's reconciler with its planner and its law of traffic,
+//! the agents' cores, and the simulated bodies with their world and its judge. Stood in for are:
+//! 1. The store, by its model in memory.
+//! 2. The transport: messages pass from hand to hand as values, after a fixed delay (`link`).
+//! 3. The shell of an agent: its ledger is durable at once, and it has no bulk connection and no launcher (`robot`).
+//! 4. The time: tokio's paused clock. A plan takes as much of it as `--plan-ms` says, by default
+//!    none, and the planner rests as long, as it does by its own time; a commit takes none.
+//!
+//! Left out are the port, identity, stops, roll-outs, and housekeeping: a shift is shorter than what any of it keeps.
+//!
 //! Modules, from the lowest to the highest: `clock`, `task_records`, `plan_log`, `link`, `robot`, `control_plane`, `floor`,
-//! `workload`, `scenario`, `progress`, `run`, `measures`, `chart`. What is real and what is stood in for stands in `run`.
+//! `workload`, `scenario`, `progress`, `run`, `measures`, `chart`.
 
 mod chart;
 mod clock;
@@ -78,6 +88,9 @@ pub struct ShiftArgs {
     /// Milliseconds that a message takes between a robot and the server.
     #[arg(long, default_value_t = 2)]
     link_ms: u64,
+    /// Milliseconds that each turn of the planner takes, after which it rests as long.
+    #[arg(long, default_value_t = 0)]
+    plan_ms: u64,
     /// Milliseconds between two heartbeats, at least 100; without it as the server says.
     #[arg(long)]
     heartbeat_ms: Option<u64>,
@@ -113,6 +126,7 @@ impl ShiftArgs {
             lasts: self.lasts(),
             seed,
             delay: Duration::from_millis(self.link_ms),
+            turn: Duration::from_millis(self.plan_ms),
             heartbeat: self.heartbeat_ms.map(Duration::from_millis),
             turns: !self.no_turns,
             scenario,
@@ -143,7 +157,8 @@ pub fn run(args: &ShiftArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> 
                 let title = outcomes.first().map(|(title, _)| title.clone()).unwrap_or_default();
                 let outcomes: Vec<Outcome> = outcomes.into_iter().map(|(_, outcome)| outcome).collect();
                 let told: Vec<_> = outcomes.iter().map(measures::measures).collect();
-                figures.extend(measures::figures(&title, &told, args.reference_per_hour));
+                let reference = args.reference_per_hour.filter(|_| *workload == Workload::W2);
+                figures.extend(measures::figures(&title, &told, reference));
                 courses.push(Course::new(title, &outcomes));
             }
         }

@@ -1,7 +1,8 @@
 //! The store as fleet's planner sees it in a shift: everything goes through to the model, and what is planned is noted.
 //!
 //! Noted are a hash of every item, how long each plan took by the wall, and what became of each task. Only fleet has
-//! this handle; the other services have the store itself. Invariant: it changes nothing and delays nothing.
+//! this handle; the other services have the store itself. Invariant: it changes nothing, and
+//! delays nothing but the planner, by the virtual time that each of its turns is to take.
 
 use super::clock::VirtualClock;
 use super::task_records::TaskRecords;
@@ -16,7 +17,7 @@ use midshift_store::{
 };
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
 /// FNV-1a, 64 bits.
@@ -47,14 +48,16 @@ pub struct PlanLog {
     store: Arc<MemoryStore>,
     clock: Arc<VirtualClock>,
     records: Arc<TaskRecords>,
+    /// Virtual time that each turn of the planner takes. It rests as long after it, so that news gather.
+    turn: Duration,
     noted: Mutex<Noted>,
 }
 
 impl PlanLog {
-    /// Nothing is noted yet.
-    pub fn new(store: Arc<MemoryStore>, clock: Arc<VirtualClock>, records: Arc<TaskRecords>) -> Self {
+    /// Nothing is noted yet. Each turn of the planner takes `turn` of virtual time.
+    pub fn new(store: Arc<MemoryStore>, clock: Arc<VirtualClock>, records: Arc<TaskRecords>, turn: Duration) -> Self {
         let plans = PlansNoted { hash: HASH_BEGIN, items: 0, items_lost: 0, plan_ms: Vec::new() };
-        Self { store, clock, records, noted: Mutex::new(Noted { plans, read_at: None }) }
+        Self { store, clock, records, turn, noted: Mutex::new(Noted { plans, read_at: None }) }
     }
 
     /// What was noted so far.
@@ -139,6 +142,9 @@ impl Store for PlanLog {
         self.store.read(parts, named).await
     }
     async fn feed(&self, after: Seq, logs: &[Log], limit: usize) -> Result<FeedPage, Error> {
+        if !self.turn.is_zero() {
+            tokio::time::sleep(self.turn).await;
+        }
         self.lock().read_at = Some(wall());
         self.store.feed(after, logs, limit).await
     }

@@ -1,8 +1,6 @@
 //! One shift from its first heartbeat to its end: opens everything on a runtime whose time is paused, and watches.
 //!
-//! Real are intake, telemetry's sessions, fleet's reconciler and planner, the agents' cores, and the bodies. The store is
-//! the model. Stood in for are the transport, the shell of an agent and its disk. Invariant: one thread, one time, one
-//! seed; nothing reads the wall but what measures it.
+//! Invariant: one thread, one time, one seed; nothing reads the wall but what measures it.
 
 use super::clock::VirtualClock;
 use super::control_plane::ControlPlane;
@@ -41,6 +39,8 @@ pub struct ShiftConfig {
     pub seed: u64,
     /// Time that a message takes between a robot and the server, each way.
     pub delay: Duration,
+    /// Virtual time that each turn of the planner takes.
+    pub turn: Duration,
     /// Pause between two heartbeats; none: as the server says.
     pub heartbeat: Option<Duration>,
     /// Turning on the spot takes a body time.
@@ -102,7 +102,8 @@ fn wall() -> Instant {
 
 async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     let (floor, clock, records) = (&config.floor, VirtualClock::begin(), Arc::new(TaskRecords::default()));
-    let mut plane = ControlPlane::open(floor.site.clone(), floor.text.clone(), clock.clone(), records.clone()).await?;
+    let mut plane =
+        ControlPlane::open(floor.site.clone(), floor.text.clone(), clock.clone(), records.clone(), config.turn).await?;
     let fleet = Arc::new(open_fleet(config, &clock)?);
     for (number, body) in (0..).zip(fleet.robots()) {
         let (telemetry, heartbeat) = (plane.telemetry.clone(), config.heartbeat);

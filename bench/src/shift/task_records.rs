@@ -155,3 +155,41 @@ impl TaskRecords {
 fn is_waiting(phase: Phase) -> bool {
     matches!(phase, Phase::Queued | Phase::RetryWait | Phase::Suspended)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::time::Utc;
+
+    fn state(records: &TaskRecords, phase: Phase, epoch: u64, now_ms: u64) {
+        let task_id = TaskId::parse("TASK-1").expect("a valid id");
+        let robot_id = RobotId::parse("rbt-01").ok().filter(|_| epoch > 0);
+        let row = serde_json::json!({
+            "task_id": task_id, "number": 1, "phase": phase, "reason": null, "then": null, "holds": [], "epoch": epoch,
+            "robot_id": robot_id, "opened_robot_id": null, "next_step": 0, "failures": 0, "refusals_in_row": 0,
+            "failed_robots": [], "semantic_refusers": [], "queued_since": Utc(0), "ready_since": null,
+            "retry_at": null, "cancel_requested": null, "started": null, "ended": null, "changed": Utc(0),
+            "stats": midshift_core::robot_events::WorkStats::default(),
+        });
+        records.note_state(&serde_json::from_value(row).expect("a row"), now_ms);
+    }
+
+    #[test]
+    fn a_task_that_loses_its_robot_waits_again_and_is_done_once() {
+        let records = TaskRecords::default();
+        records.add(TaskId::parse("TASK-1").expect("a valid id"), Urgency::Normal, 5_000, 10);
+        assert_eq!((records.counts().waiting, records.counts().open), (1, 1));
+        state(&records, Phase::Assigned, 1, 20);
+        assert_eq!((records.counts().waiting, records.busy_robots().len()), (0, 1));
+        state(&records, Phase::Queued, 1, 30);
+        assert_eq!((records.counts().waiting, records.busy_robots().len()), (1, 0));
+        state(&records, Phase::Running, 2, 40);
+        state(&records, Phase::Succeeded, 2, 90);
+        let task = records.tasks().pop().expect("one task");
+        assert_eq!((task.assignments, task.assigned_ms, task.done_ms), (2, Some(20), Some(90)));
+        let counts = records.counts();
+        assert_eq!((counts.waiting, counts.open, counts.failed, counts.ended_twice), (0, 0, 0, 0));
+        state(&records, Phase::Failed, 2, 95);
+        assert_eq!(records.counts().ended_twice, 1, "an end after the end is seen");
+    }
+}
