@@ -23,6 +23,7 @@ mod robot;
 mod roles;
 mod saturation;
 mod session_baseline;
+mod shift;
 mod simulators;
 mod soak;
 mod start;
@@ -67,6 +68,8 @@ enum Name {
     Stop(stop::StopArgs),
     /// What slow, half-open, broken and flooding peers cost a client that does no harm, and what becomes of them.
     Edge(edge::EdgeArgs),
+    /// A whole shift of a site in virtual time: what a policy of the planner gets out of a fleet.
+    Shift(shift::ShiftArgs),
     /// Memory of a server with thousands of watches that nobody reads.
     Watch(watch::WatchArgs),
     /// What the other names start: this program in one role.
@@ -115,6 +118,7 @@ fn measure(name: Name) -> anyhow::Result<RunOutcome> {
         Name::Ota(args) => return wait(async { Ok(ota::run(args, &note).await) }),
         Name::Stop(args) => return wait(async { Ok(stop::run(args, &note).await) }),
         Name::Edge(args) => return wait(async { Ok(edge::run(args, &note).await) }),
+        Name::Shift(args) => shift::run(&args, &note)?,
         Name::Watch(args) => wait(watch::run(args, &note))?,
         Name::Child(_) => anyhow::bail!("a role measures nothing"),
     };

@@ -222,3 +222,52 @@ fn reads_are_told_beside_a_call_that_reads_nothing_on_each_engine() {
     assert_told(&records, &["R1"], 1);
     assert_both_engines(&records, &["health check"]);
 }
+
+/// Plays one shift and gives what it says of its plans, and its figures by their names.
+fn shift(dir: &std::path::Path, sizes: &[&str]) -> (String, std::collections::BTreeMap<String, f64>) {
+    let (file, drawing) = (dir.join("shift.json"), dir.join("shift.svg"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_midshift-bench"));
+    command.arg("shift").args(sizes).arg("--json").arg(&file).arg("--svg").arg(&drawing);
+    let output = command.output().expect("it starts");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{said}");
+    let drawn = std::fs::read_to_string(drawing).expect("it was drawn");
+    assert!(drawn.starts_with("<svg") && drawn.ends_with("</svg>\n") && drawn.contains("<polyline"), "{drawn}");
+    let text = std::fs::read_to_string(file).expect("it wrote its figures");
+    let records: Vec<serde_json::Value> = serde_json::from_str(&text).expect("an array of records");
+    let figure = |r: &serde_json::Value| (r["name"].as_str().unwrap_or_default().to_owned(), r["median"].as_f64());
+    let figures = records.iter().map(figure).map(|(name, median)| (name, median.expect("a number"))).collect();
+    (said, figures)
+}
+
+#[test]
+fn a_shift_is_the_same_run_again_and_does_each_task_once() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let sizes = ["--robots", "4", "--hours", "0.1", "--workload", "w2,w6"];
+    let (said, figures) = shift(dir.path(), &sizes);
+    assert_eq!(said.matches(": plans ").count(), 2, "{said}");
+    assert_eq!(shift(dir.path(), &sizes).0, said, "the same seed, another run");
+    let (two, _) = shift(dir.path(), &["--robots", "4", "--hours", "0.1", "--seeds", "2"]);
+    let plans: Vec<&str> = two.lines().filter_map(|line| line.split(": plans ").nth(1)).collect();
+    assert!(plans.len() == 2 && plans[0] != plans[1], "another seed: {two}");
+    assert!(figures["fifo-nearest W2: tasks"] > 0.0 && figures["fifo-nearest W6: tasks"] > 0.0, "{figures:?}");
+    assert!(figures["fifo-nearest W2: utilisation"] > 95.0, "{figures:?}");
+    assert_rules_hold(&figures);
+}
+
+#[test]
+fn robots_of_a_shift_keep_out_of_each_others_places() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let site = concat!(env!("CARGO_MANIFEST_DIR"), "/../sites/demo.site.toml");
+    let (_, figures) = shift(dir.path(), &["--site", site, "--robots", "6", "--hours", "0.1"]);
+    assert!(figures["fifo-nearest W2: tasks"] > 0.0, "{figures:?}");
+    assert_rules_hold(&figures);
+}
+
+/// No task and no step is done twice, no item is lost, and no place is ever too full.
+fn assert_rules_hold(figures: &std::collections::BTreeMap<String, f64>) {
+    for rule in ["tasks that ended twice", "steps done twice", "items lost", "exclusion violations"] {
+        let told: Vec<_> = figures.iter().filter(|(name, _)| name.ends_with(rule)).collect();
+        assert!(!told.is_empty() && told.iter().all(|(_, times)| **times == 0.0), "{rule}: {told:?}");
+    }
+}

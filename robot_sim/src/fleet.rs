@@ -76,6 +76,8 @@ pub struct FleetConfig {
     pub faults: FaultRates,
     /// Batteries empty by work.
     pub drains: bool,
+    /// Turning on the spot takes time.
+    pub turns: bool,
     /// What a pick does not find is made on the spot.
     pub auto_stock: bool,
     /// More robots than seats stand in each other, and places are not judged.
@@ -99,6 +101,7 @@ impl FleetConfig {
             prefix: "rbt-".to_owned(),
             faults: FaultRates::default(),
             drains: true,
+            turns: true,
             auto_stock: true,
             crowded: false,
             starts: None,
@@ -192,10 +195,14 @@ impl Fleet {
         };
         for (index, start) in starts.into_iter().enumerate().filter(|(i, _)| part.contains(i)) {
             let robot_id = config.robot_id(index)?;
-            let (faults, drains) = (config.faults, config.drains);
-            let pace_permille = config.pace_permille;
-            let of_body =
-                BodyConfig { faults, drains, pace_permille, ..BodyConfig::new(robot_id.clone(), config.seed, start) };
+            let FleetConfig { faults, drains, turns, pace_permille, .. } = *config;
+            let of_body = BodyConfig {
+                faults,
+                drains,
+                turns,
+                pace_permille,
+                ..BodyConfig::new(robot_id.clone(), config.seed, start)
+            };
             let body = match &config.persistence {
                 Persistence::Memory => SimBody::new(of_body, config.site.clone(), shared.clone(), now.site)?,
                 Persistence::Dir(dir) => {

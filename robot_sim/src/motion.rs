@@ -44,6 +44,11 @@ impl Leg {
         let drive_ms = (length_mm * 1000.0 / f64::from(speed_mm_s)).ceil() as u64;
         Self { from, turn, start, turn_ms, drive_ms, length_mm, speed_mm_s, brakes_ms: None }
     }
+    /// The same leg of a body that faces its way in no time.
+    #[must_use]
+    pub fn without_turn(self) -> Self {
+        Self { turn_ms: 0, ..self }
+    }
     /// From now on it brakes, if it did not before. One that only turns has nothing to brake.
     pub fn brake(&mut self, now: SiteTime) {
         self.brakes_ms = self.brakes_ms.or(Some(self.driving_ms(now)));

@@ -29,6 +29,8 @@ pub struct BodyConfig {
     pub speed_mm_s: u32,
     /// How fast it really goes of what it is asked for, thousandths, 100..=1000.
     pub pace_permille: u32,
+    /// Turning on the spot takes time; else it faces its way at once.
+    pub turns: bool,
     /// How often things go wrong.
     pub faults: FaultRates,
     /// State of charge when it is made; none: 600..=1000, drawn.
@@ -50,6 +52,7 @@ impl BodyConfig {
             start,
             speed_mm_s: SPEED_MAX_MM_S,
             pace_permille: 1000,
+            turns: true,
             faults: FaultRates::default(),
             battery_permille: None,
             drains: true,

@@ -74,6 +74,7 @@ impl SimBody {
         let asked = if self.slow { asked.min(SPEED_FLOOR_MM_S) } else { asked };
         let driven = self.config.behaviour.speed_mm_s(asked);
         let leg = Leg::new(self.frame, (point.x_mm, point.y_mm), driven * self.config.pace_permille / 1000, now);
+        let leg = if self.config.turns { leg } else { leg.without_turn() };
         if self.lane.is_none() && leg.length_mm() >= 1.0 {
             self.lane = self.last.clone().map(|last| (last, point.waypoint.clone()));
             self.block = self.draw_block(leg.length_mm());

@@ -1,0 +1,113 @@
+//! The services of a shift in one process: intake, telemetry and fleet's reconciler, all real, on the model of the store.
+//!
+//! Left out are what serves no work: the port, identity, roll-outs, stops, housekeeping, and the files of a disk.
+
+use super::clock::VirtualClock;
+use super::plan_log::PlanLog;
+use super::task_records::TaskRecords;
+use midshift_core::heartbeat::NewestHeartbeat;
+use midshift_core::site::Site;
+use midshift_core::time::Clock;
+use midshift_fleet::FleetService;
+use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
+use midshift_task::TaskService;
+use midshift_telemetry::TelemetryService;
+use std::sync::Arc;
+use std::time::Duration;
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+/// Bytes of STATUS that are kept: nobody reads it.
+const FRAME_BYTES: u64 = 1 << 20;
+/// Entries that each log keeps: far more than any reader is behind.
+const LOG_ENTRIES: usize = 20_000;
+
+/// A planner that runs.
+struct Planner {
+    ends: CancellationToken,
+    task: JoinHandle<()>,
+    /// A planner ends once nobody can ask it any more.
+    _face: FleetService,
+}
+
+/// The services.
+pub struct ControlPlane {
+    /// Intake of tasks.
+    pub tasks: TaskService,
+    /// Sessions of robots.
+    pub telemetry: TelemetryService,
+    /// The store as the planner sees it.
+    pub plan_log: Arc<PlanLog>,
+    site: Arc<Site>,
+    site_text: String,
+    clock: Arc<VirtualClock>,
+    board: Arc<LiveBoard<NewestHeartbeat>>,
+    planner: Option<Planner>,
+}
+
+impl ControlPlane {
+    /// Opens a site with an empty store and starts everything. Each turn of the planner takes `turn`.
+    ///
+    /// # Errors
+    /// If the store cannot be read.
+    pub async fn open(
+        site: Arc<Site>,
+        site_text: String,
+        clock: Arc<VirtualClock>,
+        records: Arc<TaskRecords>,
+        turn: Duration,
+    ) -> anyhow::Result<Self> {
+        let store_id = StoreId(Arc::from("shift"));
+        let any_clock: Arc<dyn Clock> = clock.clone();
+        let model = MemoryStore::new(site.site_id().clone(), store_id, any_clock.clone());
+        let model = Arc::new(model.with_log_entries_max(LOG_ENTRIES));
+        let store: Arc<dyn Store> = model.clone();
+        let plan_log = Arc::new(PlanLog::new(model, clock.clone(), records, turn));
+        let board = LiveBoard::new();
+        let parts = midshift_telemetry::Parts {
+            store: store.clone(),
+            frames: Arc::new(MemoryFrames::new(any_clock.clone(), FRAME_BYTES)),
+            board: board.clone(),
+            heard: None,
+            clock: any_clock.clone(),
+            bugs: Default::default(),
+        };
+        let telemetry = TelemetryService::new(parts, CancellationToken::new());
+        tokio::spawn(telemetry.clone().run());
+        let parts = midshift_task::Parts { store, site: site.clone(), clock: any_clock, bugs: Default::default() };
+        let tasks = TaskService::open(parts, CancellationToken::new()).await?;
+        let mut plane = Self { tasks, telemetry, plan_log, site, site_text, clock, board, planner: None };
+        plane.start_planner();
+        Ok(plane)
+    }
+
+    /// Starts fleet's reconciler, if it does not run.
+    pub fn start_planner(&mut self) {
+        if self.planner.is_some() {
+            return;
+        }
+        let parts = midshift_fleet::Parts {
+            store: self.plan_log.clone(),
+            board: self.board.clone(),
+            site: self.site.clone(),
+            site_text: self.site_text.clone(),
+            map: Default::default(),
+            clock: self.clock.clone(),
+            bugs: Default::default(),
+        };
+        let (face, reconciler) = FleetService::new(parts);
+        let ends = CancellationToken::new();
+        let running = reconciler.run(ends.clone());
+        let task = tokio::spawn(async move { drop(running.await) });
+        self.planner = Some(Planner { ends, task, _face: face });
+    }
+
+    /// Ends fleet's reconciler, as when its process is stopped.
+    pub async fn stop_planner(&mut self) {
+        if let Some(planner) = self.planner.take() {
+            planner.ends.cancel();
+            // It never panics in a run that goes on: what it found is in the store.
+            let _ = planner.task.await;
+        }
+    }
+}

@@ -1,0 +1,161 @@
+//! One shift from its first heartbeat to its end: opens everything on a runtime whose time is paused, and watches.
+//!
+//! Invariant: one thread, one time, one seed; nothing reads the wall but what measures it.
+
+use super::clock::VirtualClock;
+use super::control_plane::ControlPlane;
+use super::floor::Floor;
+use super::plan_log::PlansNoted;
+use super::progress::ProgressWatch;
+use super::robot::{Robot, RobotConfig};
+use super::scenario::{BodyFaults, Scenario};
+use super::task_records::{TaskCounts, TaskRecord, TaskRecords};
+use super::workload::Client;
+use midshift_core::ids::TaskId;
+use midshift_core::time::Clock;
+use midshift_sim::faults::FaultRates;
+use midshift_sim::fleet::{Fleet, FleetConfig, FleetReport};
+use std::ops::Range;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// The fleet is looked at this often, and the person who looks after broken robots goes round.
+const LOOK: Duration = Duration::from_secs(5);
+/// Robots are switched on one after the other, so far apart.
+const SWITCHED_ON: Duration = Duration::from_millis(13);
+/// Work begins once every robot has had so long.
+const WORK_BEGINS: Duration = Duration::from_secs(3);
+
+/// What one shift is.
+#[derive(Clone)]
+pub struct ShiftConfig {
+    /// Where it is.
+    pub floor: Arc<Floor>,
+    /// How many robots.
+    pub robots: usize,
+    /// How long it lasts.
+    pub lasts: Duration,
+    /// Decides all that is drawn.
+    pub seed: u64,
+    /// Time that a message takes between a robot and the server, each way.
+    pub delay: Duration,
+    /// Virtual time that each turn of the planner takes.
+    pub turn: Duration,
+    /// Pause between two heartbeats; none: as the server says.
+    pub heartbeat: Option<Duration>,
+    /// Turning on the spot takes a body time.
+    pub turns: bool,
+    /// What is asked for, and what goes wrong.
+    pub scenario: Scenario,
+}
+
+/// The fleet at one moment.
+#[derive(Clone, Copy, Debug)]
+pub struct Sample {
+    /// Since the beginning, milliseconds.
+    pub at_ms: u64,
+    /// Tasks at that moment.
+    pub counts: TaskCounts,
+}
+
+/// What came of a shift.
+pub struct Outcome {
+    /// Robots that there were.
+    pub robots: usize,
+    /// How long it lasted, milliseconds.
+    pub lasted_ms: u64,
+    /// Every task.
+    pub tasks: Vec<TaskRecord>,
+    /// Tasks at the end.
+    pub counts: TaskCounts,
+    /// What was planned.
+    pub plans: PlansNoted,
+    /// What the bodies did, and whether they broke a rule.
+    pub bodies: FleetReport,
+    /// Robots with a task that came on with nothing, summed up.
+    pub no_progress: Duration,
+    /// The fleet over time.
+    pub samples: Vec<Sample>,
+    /// When the planner was away.
+    pub planner_stop: Option<Range<Duration>>,
+    /// Time that the run took by the wall.
+    pub wall: Duration,
+}
+
+/// Runs one shift.
+///
+/// # Errors
+/// A task that is refused, a fleet that the site has no room for, or a store that cannot be read.
+pub fn run(config: &ShiftConfig) -> anyhow::Result<Outcome> {
+    let begun = wall();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build()?;
+    let outcome = runtime.block_on(play(config))?;
+    // Robots and services run for ever: they are dropped where they are.
+    runtime.shutdown_background();
+    Ok(Outcome { wall: begun.elapsed(), ..outcome })
+}
+
+#[expect(clippy::disallowed_methods, reason = "how long a run takes is real time")]
+fn wall() -> Instant {
+    Instant::now()
+}
+
+async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
+    let (floor, clock, records) = (&config.floor, VirtualClock::begin(), Arc::new(TaskRecords::default()));
+    let mut plane =
+        ControlPlane::open(floor.site.clone(), floor.text.clone(), clock.clone(), records.clone(), config.turn).await?;
+    let fleet = Arc::new(open_fleet(config, &clock)?);
+    for (number, body) in (0..).zip(fleet.robots()) {
+        let (telemetry, heartbeat) = (plane.telemetry.clone(), config.heartbeat);
+        let robot = Robot::new(body.clone(), clock.clone(), telemetry, RobotConfig { delay: config.delay, heartbeat });
+        tokio::spawn(robot.run(SWITCHED_ON * number));
+    }
+    tokio::time::sleep(WORK_BEGINS + SWITCHED_ON * config.robots as u32).await;
+    let source = floor.tasks(config.seed)?;
+    let client = Client::new(plane.tasks.clone(), source, records.clone(), clock.clone(), config.seed);
+    let asking = client.run(config.scenario.demand, config.robots);
+    tokio::pin!(asking);
+    let mut progress = ProgressWatch::new(fleet.clone(), records.clone());
+    let mut samples = Vec::new();
+    let lasts_ms = config.lasts.as_millis() as u64;
+    while clock.elapsed_ms() < lasts_ms {
+        tokio::select! {
+            biased;
+            ended = &mut asking => ended?,
+            () = tokio::time::sleep(LOOK) => {
+                let now = clock.now().site;
+                samples.push(Sample { at_ms: clock.elapsed_ms(), counts: records.counts() });
+                progress.look(now);
+                if config.scenario.faults == BodyFaults::Usual {
+                    fleet.person_round(now, &|task_id: &TaskId| records.is_worked_on(task_id));
+                }
+                if let Some(stop) = &config.scenario.planner_stop {
+                    let is_away = stop.contains(&Duration::from_millis(clock.elapsed_ms()));
+                    if is_away { plane.stop_planner().await } else { plane.start_planner() }
+                }
+            }
+        }
+    }
+    Ok(Outcome {
+        robots: config.robots,
+        lasted_ms: clock.elapsed_ms(),
+        tasks: records.tasks(),
+        counts: records.counts(),
+        plans: plane.plan_log.plans(),
+        bodies: fleet.report(clock.now().site)?,
+        no_progress: progress.no_progress(),
+        samples,
+        planner_stop: config.scenario.planner_stop.clone(),
+        wall: Duration::ZERO,
+    })
+}
+
+/// Bodies whose batteries do not empty: no floor of this bench has chargers for them.
+fn open_fleet(config: &ShiftConfig, clock: &VirtualClock) -> anyhow::Result<Fleet> {
+    let faults = match config.scenario.faults {
+        BodyFaults::None => FaultRates::none(),
+        BodyFaults::Usual => FaultRates::default(),
+    };
+    let of_site = FleetConfig::new(config.floor.site.clone(), config.robots, config.seed);
+    Ok(Fleet::open(&FleetConfig { faults, drains: false, turns: config.turns, ..of_site }, &clock.now())?)
+}

@@ -1,0 +1,195 @@
+//! What became of each task of a shift, and who waits for what: fed by every row of a task that fleet commits.
+
+use midshift_core::ids::{RobotId, TaskId};
+use midshift_core::task::TaskState;
+use midshift_core::task::machine::Phase;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use tokio::sync::Notify;
+
+/// How urgent a task is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Urgency {
+    /// As most of the work.
+    Normal,
+    /// Before all others.
+    Urgent,
+}
+
+/// One task. Times are milliseconds since the beginning of the shift.
+#[derive(Clone, Debug)]
+pub struct TaskRecord {
+    /// How urgent it is.
+    pub urgency: Urgency,
+    /// The way that it asks for, from its first goal to its last, millimetres.
+    pub way_mm: u64,
+    /// When it was submitted.
+    pub submitted_ms: u64,
+    /// When a robot was named for it for the first time.
+    pub assigned_ms: Option<u64>,
+    /// When it was done.
+    pub done_ms: Option<u64>,
+    /// Robots that were named for it, one after the other.
+    pub assignments: u32,
+    phase: Phase,
+    epoch: u64,
+    robot_id: Option<RobotId>,
+}
+
+#[derive(Default)]
+struct Records {
+    tasks: BTreeMap<TaskId, TaskRecord>,
+    busy: BTreeSet<RobotId>,
+    waiting: usize,
+    open: usize,
+    /// Ended in another way than done.
+    failed: u64,
+    /// Said to be done once more after they had ended.
+    ended_twice: u64,
+}
+
+/// The records of one shift.
+#[derive(Default)]
+pub struct TaskRecords {
+    records: Mutex<Records>,
+    changed: Notify,
+}
+
+/// What is counted at one moment.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct TaskCounts {
+    /// Without a robot.
+    pub waiting: usize,
+    /// Not ended.
+    pub open: usize,
+    /// Ended in another way than done.
+    pub failed: u64,
+    /// Said to have ended although they had ended before.
+    pub ended_twice: u64,
+}
+
+impl TaskRecords {
+    fn lock(&self) -> MutexGuard<'_, Records> {
+        self.records.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A task is submitted now.
+    pub fn add(&self, task_id: TaskId, urgency: Urgency, way_mm: u64, now_ms: u64) {
+        let record = TaskRecord {
+            urgency,
+            way_mm,
+            submitted_ms: now_ms,
+            assigned_ms: None,
+            done_ms: None,
+            assignments: 0,
+            phase: Phase::Queued,
+            epoch: 0,
+            robot_id: None,
+        };
+        let mut records = self.lock();
+        records.tasks.insert(task_id, record);
+        records.waiting += 1;
+        records.open += 1;
+    }
+
+    /// A committed row says where a task is.
+    pub fn note_state(&self, state: &TaskState, now_ms: u64) {
+        let mut records = self.lock();
+        let Some(record) = records.tasks.get_mut(&state.task_id) else { return };
+        let before = std::mem::replace(&mut record.phase, state.phase);
+        if state.epoch > record.epoch {
+            record.epoch = state.epoch;
+            record.assignments += 1;
+            record.assigned_ms.get_or_insert(now_ms);
+        }
+        let has_robot = !is_waiting(state.phase) && !state.phase.is_terminal();
+        let robot_id = state.robot_id.clone().filter(|_| has_robot);
+        let left = std::mem::replace(&mut record.robot_id, robot_id.clone());
+        let ends = state.phase.is_terminal() && !before.is_terminal();
+        if ends && state.phase == Phase::Succeeded {
+            record.done_ms = Some(now_ms);
+        }
+        records.busy.retain(|robot_id| left.as_ref() != Some(robot_id));
+        records.busy.extend(robot_id);
+        records.ended_twice += u64::from(before.is_terminal() && state.phase != before);
+        records.failed += u64::from(ends && state.phase != Phase::Succeeded);
+        records.open -= usize::from(ends);
+        match (is_waiting(before), is_waiting(state.phase)) {
+            (true, false) => records.waiting -= 1,
+            (false, true) => records.waiting += 1,
+            _ => return,
+        }
+        drop(records);
+        self.changed.notify_one();
+    }
+
+    /// Resolves when a task found a robot, lost it, or ended.
+    pub async fn changed(&self) {
+        self.changed.notified().await;
+    }
+
+    /// What is counted now.
+    pub fn counts(&self) -> TaskCounts {
+        let records = self.lock();
+        let Records { waiting, open, failed, ended_twice, .. } = &*records;
+        TaskCounts { waiting: *waiting, open: *open, failed: *failed, ended_twice: *ended_twice }
+    }
+
+    /// Robots that have a task.
+    pub fn busy_robots(&self) -> BTreeSet<RobotId> {
+        self.lock().busy.clone()
+    }
+
+    /// Whether a task has not ended, and waits for no person.
+    pub fn is_worked_on(&self, task_id: &TaskId) -> bool {
+        let over = |phase: Phase| phase.is_terminal() || phase == Phase::NeedsOperator;
+        self.lock().tasks.get(task_id).is_some_and(|task| !over(task.phase))
+    }
+
+    /// Every task, in the order of its id.
+    pub fn tasks(&self) -> Vec<TaskRecord> {
+        self.lock().tasks.values().cloned().collect()
+    }
+}
+
+fn is_waiting(phase: Phase) -> bool {
+    matches!(phase, Phase::Queued | Phase::RetryWait | Phase::Suspended)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::time::Utc;
+
+    fn state(records: &TaskRecords, phase: Phase, epoch: u64, now_ms: u64) {
+        let task_id = TaskId::parse("TASK-1").expect("a valid id");
+        let robot_id = RobotId::parse("rbt-01").ok().filter(|_| epoch > 0);
+        let row = serde_json::json!({
+            "task_id": task_id, "number": 1, "phase": phase, "reason": null, "then": null, "holds": [], "epoch": epoch,
+            "robot_id": robot_id, "opened_robot_id": null, "next_step": 0, "failures": 0, "refusals_in_row": 0,
+            "failed_robots": [], "semantic_refusers": [], "queued_since": Utc(0), "ready_since": null,
+            "retry_at": null, "cancel_requested": null, "started": null, "ended": null, "changed": Utc(0),
+            "stats": midshift_core::robot_events::WorkStats::default(),
+        });
+        records.note_state(&serde_json::from_value(row).expect("a row"), now_ms);
+    }
+
+    #[test]
+    fn a_task_that_loses_its_robot_waits_again_and_is_done_once() {
+        let records = TaskRecords::default();
+        records.add(TaskId::parse("TASK-1").expect("a valid id"), Urgency::Normal, 5_000, 10);
+        assert_eq!((records.counts().waiting, records.counts().open), (1, 1));
+        state(&records, Phase::Assigned, 1, 20);
+        assert_eq!((records.counts().waiting, records.busy_robots().len()), (0, 1));
+        state(&records, Phase::Queued, 1, 30);
+        assert_eq!((records.counts().waiting, records.busy_robots().len()), (1, 0));
+        state(&records, Phase::Running, 2, 40);
+        state(&records, Phase::Succeeded, 2, 90);
+        let task = records.tasks().pop().expect("one task");
+        assert_eq!((task.assignments, task.assigned_ms, task.done_ms), (2, Some(20), Some(90)));
+        let counts = records.counts();
+        assert_eq!((counts.waiting, counts.open, counts.failed, counts.ended_twice), (0, 0, 0, 0));
+        state(&records, Phase::Failed, 2, 95);
+        assert_eq!(records.counts().ended_twice, 1, "an end after the end is seen");
+    }
+}
