@@ -64,7 +64,7 @@ pub struct ShiftArgs {
     /// List of tasks; without it transports are drawn between stations.
     #[arg(long)]
     tasks: Option<PathBuf>,
-    /// Robots.
+    /// How many robots work.
     #[arg(long, default_value_t = 8)]
     robots: usize,
     /// Hours of virtual time.

@@ -31,7 +31,7 @@ impl ProgressWatch {
     }
 
     /// Looks at every robot that has a task.
-    pub fn look(&mut self, now: SiteTime) {
+    pub fn look_at_robots(&mut self, now: SiteTime) {
         let since_look_ms = now.since(std::mem::replace(&mut self.looked, now)).as_ms();
         let mut stands = BTreeMap::new();
         for robot_id in self.records.busy_robots() {

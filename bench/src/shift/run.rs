@@ -125,7 +125,7 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
             () = tokio::time::sleep(LOOK) => {
                 let now = clock.now().site;
                 samples.push(Sample { at_ms: clock.elapsed_ms(), counts: records.counts() });
-                progress.look(now);
+                progress.look_at_robots(now);
                 if config.scenario.faults == BodyFaults::Usual {
                     fleet.person_round(now, &|task_id: &TaskId| records.is_worked_on(task_id));
                 }

@@ -41,7 +41,7 @@ pub struct Scenario {
 /// Whether bodies fail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BodyFaults {
-    /// Never.
+    /// They do not.
     None,
     /// As in `dev`; a person looks after them.
     Usual,
