@@ -90,11 +90,13 @@ impl DataFile {
         Ok(connection)
     }
 
-    /// Connections that only read. They are not asked whether they live before each use: nothing ends one of a file, and the question would be one
-    /// hop more to its thread and back.
+    /// Connections that only read. They stay, and are not asked whether they live before each use: nothing ends one of a file, the question would be
+    /// one hop more to its thread and back, and a new one would be a new thread that reads the schema and fills its pages anew.
     pub(crate) async fn readers(&self) -> Result<SqlitePool, OpenError> {
         SqlitePoolOptions::new()
             .max_connections(READERS)
+            .max_lifetime(None)
+            .idle_timeout(None)
             .test_before_acquire(false)
             .connect_with(self.options().pragma("query_only", "1"))
             .await

@@ -2,10 +2,11 @@
 //! a table are touched only where a row moves in them.
 //!
 //! Invariant: what is known here is what the last commit left; after a commit of unknown outcome everything is forgotten.
-//! Bounded by two generations: a key that is not asked for during a whole generation is dropped.
+//! Bounded by two generations: a key that is not asked for during a whole generation is dropped. Of a task that is over little stays: what is
+//! gone and what is written once is asked of the file, if anybody asks.
 
 use crate::group::CurrentRevision;
-use midshift_core::rows::{Index, Key, Revision, Row};
+use midshift_core::rows::{Index, Key, Revision, Row, Table};
 use std::collections::HashMap;
 
 /// Keys of one generation. 50,000 keys are about 10 MB.
@@ -61,15 +62,31 @@ impl Revisions {
         self.young.insert(key, standing);
     }
 
+    /// What a commit left of a row; none: it is gone.
+    pub(super) fn settle(&mut self, key: Key, row: Option<Row>) {
+        match row.filter(|_| !is_written_once(key.table)) {
+            Some(row) => self.note(key, Some((row.revision, row.index))),
+            None => {
+                self.young.remove(&key);
+                self.old.remove(&key);
+            }
+        }
+    }
+
     pub(super) fn forget_all(&mut self) {
         *self = Self::default();
     }
 }
 
+/// Whether no later item is about a row of it, until it goes.
+fn is_written_once(table: Table) -> bool {
+    matches!(table, Table::TaskIntake | Table::RequestKey | Table::CommandKey | Table::OtaCommandKey)
+        || table.is_audit()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use midshift_core::rows::Table;
 
     fn key(n: usize) -> Key {
         Key::new(Table::Attempt, n.to_string())
@@ -102,6 +119,29 @@ mod tests {
         assert_eq!(revisions.get(&key(0)), Some(None));
         revisions.forget_all();
         assert_eq!(revisions.get(&key(0)), None);
+    }
+
+    #[test]
+    fn what_is_gone_and_what_is_written_once_is_asked_of_the_file() {
+        let mut revisions = Revisions::default();
+        let row = |table| Row {
+            key: Key::new(table, "1"),
+            revision: Revision(1),
+            index: Index::default(),
+            body: "{}".into(),
+        };
+        for table in [Table::TaskIntake, Table::RequestKey, Table::TaskAudit, Table::Timer] {
+            let row = row(table);
+            // As each commit begins: whether there is such a row.
+            revisions.note(row.key.clone(), None);
+            revisions.settle(row.key.clone(), Some(row));
+        }
+        let timer = Key::new(Table::Timer, "1");
+        assert_eq!(revisions.get(&timer), Some(Some(Revision(1))));
+        revisions.old.insert(timer.clone(), at(1, 1));
+        revisions.settle(timer.clone(), None);
+        assert_eq!(revisions.get(&timer), None);
+        assert!(revisions.young.is_empty() && revisions.old.is_empty());
     }
 
     #[test]

@@ -141,7 +141,7 @@ impl Writer {
             self.chains = Some(group.chains);
         }
         for (key, row) in group.rows {
-            self.revisions.note(key, row.map(|row| (row.revision, row.index)));
+            self.revisions.settle(key, row);
         }
         if group.head > self.head {
             self.head = group.head;
