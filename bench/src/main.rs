@@ -1,5 +1,6 @@
 //! Figures of midshift beside the raw limits of the same machine in the same run: `cargo run --release -p midshift-bench -- NAME --json FILE`.
 
+mod arguments;
 mod child;
 mod durable_baseline;
 mod edge;

@@ -19,6 +19,8 @@ use std::process::Command;
 const SPLIT_ROBOTS: &str = "200";
 /// Hours of a soak on each engine, unless told.
 const SOAK_HOURS: f64 = 1.5;
+/// Most of them: two months.
+const SOAK_HOURS_MAX: f64 = 1_500.0;
 /// Tasks that are over at an old site.
 const OLD_TASKS: &str = "1000000";
 
@@ -173,7 +175,7 @@ fn soak_hours(sweeps: &[Sweep], hours: Option<f64>) -> Result<f64> {
     let soaks = sweeps.is_empty() || sweeps.contains(&Sweep::Soak);
     ensure!(hours.is_none() || soaks, "--hours is for soak, which you did not name: leave it out");
     let hours = hours.unwrap_or(SOAK_HOURS);
-    ensure!(hours > 0.0 && hours.is_finite(), "--hours must be more than 0");
+    ensure!(hours > 0.0 && hours <= SOAK_HOURS_MAX, "--hours must be more than 0 and at most {SOAK_HOURS_MAX}");
     Ok(hours)
 }
 
@@ -291,6 +293,6 @@ mod tests {
         assert_eq!(soak_hours(&[Sweep::Soak, Sweep::Kills], Some(8.0)).expect("a soak"), 8.0);
         assert_eq!(soak_hours(&[], None).expect("all"), SOAK_HOURS);
         assert!(soak_hours(&[Sweep::Kills], Some(8.0)).is_err());
-        assert!([0.0, -1.0, f64::NAN, f64::INFINITY].iter().all(|hours| soak_hours(&[], Some(*hours)).is_err()));
+        assert!([0.0, -1.0, f64::NAN, f64::INFINITY, 1e20].iter().all(|hours| soak_hours(&[], Some(*hours)).is_err()));
     }
 }

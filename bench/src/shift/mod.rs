@@ -27,8 +27,10 @@ mod scenario;
 mod task_records;
 mod workload;
 
+use crate::arguments::parse_time;
 use crate::figure::Figure;
 use chart::Course;
+use clap::builder::RangedU64ValueParser;
 use floor::{Floor, TaskForm};
 use plan_log::PlansNoted;
 use run::{Outcome, ShiftConfig};
@@ -65,16 +67,16 @@ pub struct ShiftArgs {
     #[arg(long)]
     tasks: Option<PathBuf>,
     /// How many robots work.
-    #[arg(long, default_value_t = 8)]
+    #[arg(long, default_value_t = 8, value_parser = RangedU64ValueParser::<usize>::new().range(1..))]
     robots: usize,
     /// Hours of virtual time.
-    #[arg(long, default_value_t = 8.0)]
+    #[arg(long, default_value_t = 8.0, value_parser = parse_time)]
     hours: f64,
     /// How robots are chosen.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "fifo-nearest")]
     policy: Vec<Policy>,
     /// Runs, each with the next seed from 1.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     seeds: u64,
     /// What is asked of the fleet.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "w2")]
@@ -92,7 +94,7 @@ pub struct ShiftArgs {
     #[arg(long, default_value_t = 0)]
     plan_ms: u64,
     /// Milliseconds between two heartbeats, at least 100; without it as the server says.
-    #[arg(long)]
+    #[arg(long, value_parser = clap::value_parser!(u64).range(100..))]
     heartbeat_ms: Option<u64>,
     /// Tasks visit their two places and handle nothing there.
     #[arg(long)]

@@ -4,6 +4,7 @@
 mod load;
 mod samples;
 
+use crate::arguments::parse_time;
 use crate::engine::{Bed, Engine, EngineArgs};
 use crate::figure::Figure;
 use crate::ota::server::rollouts::Rollouts;
@@ -28,7 +29,7 @@ const OPEN: &str = "midshift_fleet_tasks_open";
 #[derive(Clone, Debug, clap::Args)]
 pub struct SoakArgs {
     /// Minutes of the run on each engine, once the robots are there.
-    #[arg(long, default_value_t = 90.0)]
+    #[arg(long, default_value_t = 90.0, value_parser = parse_time)]
     minutes: f64,
     /// Simulated robots at work.
     #[arg(long, default_value_t = 500)]
@@ -37,7 +38,7 @@ pub struct SoakArgs {
     #[arg(long, default_value_t = 4)]
     rate: u32,
     /// Minutes between the end of a roll-out and the next one.
-    #[arg(long, default_value_t = 5.0)]
+    #[arg(long, default_value_t = 5.0, value_parser = parse_time)]
     rollout_minutes: f64,
     #[command(flatten)]
     engine: EngineArgs,
