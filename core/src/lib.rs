@@ -21,6 +21,7 @@ pub mod leadership;
 pub mod limits;
 pub mod nearest;
 pub mod overload;
+pub mod planner_policy;
 pub mod policy;
 pub mod presence;
 pub mod privacy;

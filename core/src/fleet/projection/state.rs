@@ -14,6 +14,7 @@ use crate::drain_request::{DrainRelease, DrainRequest};
 use crate::fleet::bugs::Bugs;
 use crate::identity::RobotIdentity;
 use crate::ids::{AttemptId, RobotId, TaskId};
+use crate::planner_policy::PlannerPolicy;
 use crate::policy::AreaPolicy;
 use crate::projection::{Indexed, projection};
 use crate::reason::Reason;
@@ -228,6 +229,11 @@ impl FleetProjection {
     pub fn robot_holds(&self, robot: &RobotId) -> impl Iterator<Item = &HoldToken> {
         let from = format_smolstr!("robot:{robot}:");
         self.holds.range(from.clone()..).take_while(move |(id, _)| id.starts_with(&*from)).map(|(_, h)| &h.row)
+    }
+
+    /// Rules of the planner.
+    pub fn planner(&self) -> PlannerPolicy {
+        PlannerPolicy::default_of(self.site.site_id().clone())
     }
 
     /// Rules of an area, as they are composed for robots and shown to people.
