@@ -20,7 +20,8 @@ pub struct Candidate {
     pub robot_id: RobotId,
     /// Where it stands.
     pub at: WaypointIx,
-    tasks: u64,
+    /// Tasks that it was given so far.
+    pub tasks: u64,
 }
 
 /// Robots that tasks are given to one after the other.

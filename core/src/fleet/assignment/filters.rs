@@ -24,11 +24,8 @@ use crate::time::Now;
 /// Charge that must be left at the charger, permille: an hour and a half of waiting on the way.
 pub const RESERVE_PERMILLE: u64 = 100;
 
-/// Whether the robot can be given any work at all now.
-pub fn robot(view: &FleetProjection, board: &Board, robot_id: &RobotId, now: &Now) -> Result<(), Reason> {
-    let Some(session) = view.sessions.get(robot_id.as_str()).map(|s| &s.row) else {
-        return Err(Code::RobotOffline.into());
-    };
+/// Whether the robot could be given work if nothing had it: nothing that lasts keeps it from work.
+pub fn in_work(view: &FleetProjection, board: &Board, robot_id: &RobotId, now: &Now) -> Result<(), Reason> {
     match liveness::presence(board, robot_id, now) {
         Presence::Online => {}
         Presence::Suspect => return Err(Code::RobotSuspect.into()),
@@ -43,9 +40,14 @@ pub fn robot(view: &FleetProjection, board: &Board, robot_id: &RobotId, now: &No
     if let Some(why) = maps::differs(view, live) {
         return Err(why);
     }
-    if let Some(why) = claims::broken(view, robot_id) {
-        return Err(why);
-    }
+    claims::broken(view, robot_id).map_or(Ok(()), Err)
+}
+
+/// Whether the robot can be given any work at all now.
+pub fn robot(view: &FleetProjection, board: &Board, robot_id: &RobotId, now: &Now) -> Result<(), Reason> {
+    let (session, live) = (view.sessions.get(robot_id.as_str()).map(|s| &s.row), board.get(robot_id));
+    let Some((session, live)) = session.zip(live) else { return Err(Code::RobotOffline.into()) };
+    in_work(view, board, robot_id, now)?;
     match view.authority.get(robot_id.as_str()).map(|a| &a.row.holder) {
         None | Some(RobotHolder::None) => {}
         Some(RobotHolder::Attempt(id)) => return Err(Reason::from(Code::RobotBusy).with("attempt", id)),

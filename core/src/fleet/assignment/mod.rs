@@ -6,5 +6,9 @@
 pub mod assign;
 pub mod candidates;
 pub mod errands;
+pub mod estimate;
 pub mod filters;
+pub mod nearest;
+pub mod offers;
 pub mod readiness;
+pub mod rolling;

@@ -7,6 +7,7 @@
 
 use crate::drain_request::{DrainRelease, DrainRequest};
 use crate::fleet::assignment::errands;
+use crate::fleet::assignment::estimate::Rest;
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::{Drain, DrainState, RobotAuthority, RobotHolder};
@@ -18,7 +19,6 @@ use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{DrainId, RobotId};
 use crate::reason::{Code, Reason};
 use crate::site::{Kind, WaypointIx};
-use crate::step::StepKind;
 use crate::task::Event;
 use crate::task::state::Errand;
 use crate::time::Now;
@@ -173,15 +173,8 @@ fn further(tx: &mut Tx, drain: &Drain, board: &Board) {
 fn rest_ms(view: &FleetProjection, task_id: &crate::ids::TaskId, live: &NewestHeartbeat) -> u64 {
     let Some((task, intake)) = view.task(task_id).zip(view.intake(task_id)) else { return 0 };
     let done = live.report.attempts.iter().map(|a| a.step_index).max().unwrap_or(task.next_step) as usize;
-    let steps = &intake.spec.steps;
-    let actions = steps.iter().skip(done).filter(|s| !matches!(s.kind, StepKind::Goto { .. })).count() as u64;
-    let goals: Option<Vec<_>> = intake.spec.goals(done).map(|goal| view.site.find(goal)).collect();
-    let here = routing::find(view, live.report.vitals.waypoint.as_ref());
-    let way_mm = here
-        .zip(goals)
-        .and_then(|(here, goals)| routing::legs_mm(view, here, &goals))
-        .map_or(0, |legs| legs.iter().sum());
-    way_mm * 1_000 / PLANNED_MM_S + actions * PLANNED_ACTION_MS
+    let rest = Rest::of_task(view, intake, done, live);
+    rest.way_mm * 1_000 / PLANNED_MM_S + rest.actions * PLANNED_ACTION_MS + rest.waits_ms
 }
 
 /// The robot stands where it may stand for long, and what it says is newer than what it last did. One that was never heard rests too.

@@ -3,7 +3,7 @@
 use super::rows::Timer;
 use crate::ids::{RobotId, TaskId};
 use crate::reason::Code;
-use crate::time::LinkTime;
+use crate::time::{LinkTime, SiteDuration, SiteTime};
 use smol_str::SmolStr;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -44,6 +44,30 @@ pub struct Waiting {
     pub places: Vec<crate::ids::PlaceId>,
     /// Since when.
     pub since: crate::time::SiteTime,
+}
+
+/// Ready tasks that the newest plan means for robots which are free soon. Volatile: no promise.
+#[derive(Clone, Debug, Default)]
+pub struct Meant(BTreeMap<TaskId, (RobotId, SiteTime)>);
+
+impl Meant {
+    /// A task is meant for no robot for longer than this without getting one, site time.
+    const FOR: SiteDuration = SiteDuration::from_secs(30);
+
+    /// The robot that a task is meant for.
+    pub fn robot_of(&self, task_id: &TaskId) -> Option<&RobotId> {
+        self.0.get(task_id).map(|(robot_id, _)| robot_id)
+    }
+    /// Whether a task was meant for one robot or another for so long that it goes to one that is free.
+    pub fn is_over(&self, task_id: &TaskId, now: SiteTime) -> bool {
+        self.0.get(task_id).is_some_and(|(_, since)| now.since(*since) > Self::FOR)
+    }
+    /// What a plan means.
+    pub(in crate::fleet) fn put(&mut self, meant: BTreeMap<TaskId, RobotId>, now: SiteTime) {
+        let before = std::mem::take(&mut self.0);
+        let since = |task_id: &TaskId| before.get(task_id).map_or(now, |(_, since)| *since);
+        self.0 = meant.into_iter().map(|(task_id, robot)| (task_id.clone(), (robot, since(&task_id)))).collect();
+    }
 }
 
 /// What lasts, by robot and code: since when it lasts or was last seen as an open incident, link clock. Volatile.

@@ -12,6 +12,7 @@ pub mod loading;
 pub mod memory;
 pub mod objects;
 pub mod queue;
+pub mod ready;
 pub mod refused;
 pub mod rows;
 pub mod state;

@@ -252,6 +252,23 @@ impl Queue {
         let walked = |robot_id: &RobotId| walk.robots.contains(robot_id) || self.left.contains(robot_id);
         !present.iter().all(walked) || !(self.news.is_empty() || self.left.is_empty())
     }
+    /// Robots of those `present` that found nothing, and were not `heard` since.
+    pub(in crate::fleet) fn rested(
+        &mut self,
+        present: &BTreeSet<RobotId>,
+        heard: &BTreeSet<RobotId>,
+    ) -> BTreeSet<RobotId> {
+        self.left.retain(|robot_id| present.contains(robot_id) && !heard.contains(robot_id));
+        self.left.clone()
+    }
+    /// Ready tasks that came since they were last taken: whoever rests has not seen them.
+    pub(in crate::fleet) fn take_news(&mut self) -> BTreeSet<Rank> {
+        std::mem::take(&mut self.news)
+    }
+    /// These robots found nothing among all tasks.
+    pub(in crate::fleet) fn let_rest(&mut self, robots: BTreeSet<RobotId>) {
+        self.left.extend(robots);
+    }
     /// The next task of a walk.
     pub(in crate::fleet) fn next(&self, walk: &mut Walk) -> Option<TaskId> {
         let tasks = walk.only.as_ref().unwrap_or(&self.ready);

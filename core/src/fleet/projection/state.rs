@@ -2,8 +2,9 @@
 //!
 //! Every room of `fleet` reads it. Rows come in by `loading`; `index` keeps what is derived.
 
-use super::memory::{Agenda, AttachedTime, Lasting, UnansweredOffers, Unexplained, Waiting};
+use super::memory::{Agenda, AttachedTime, Lasting, Meant, UnansweredOffers, Unexplained, Waiting};
 use super::queue::Queue;
+use super::ready::ReadyTasks;
 use super::refused::Refused;
 use super::rows::{
     AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, PlaceHolder, RobotAuthority, RobotControl,
@@ -102,6 +103,8 @@ projection! {
         unanswered_offers: UnansweredOffers = UnansweredOffers::default();
         /// What robots say of themselves that only a person ends.
         lasting: Lasting = Lasting::new();
+        /// Robots that ready tasks are meant for once those are free.
+        meant: Meant = Meant::default();
         /// What stands without a reason.
         unexplained: Unexplained = Unexplained::default();
         /// The attempt that a robot lists and no row knows, and since when, link clock.
@@ -120,6 +123,8 @@ projection! {
         site: Arc<Site> = site;
         /// Tasks that wait for a robot.
         queue: Queue = Queue::new(read.utc);
+        /// Those of them that are ready, by need and goal.
+        ready: ReadyTasks = ReadyTasks::default();
         /// Tasks that have not ended, by deadline.
         deadlines: BTreeSet<(Utc, TaskId)> = BTreeSet::new();
         /// What is due by time and not done yet. Volatile.

@@ -143,7 +143,7 @@ pub(in crate::fleet) fn could_ever(
     Err(against.into_iter().fold(reason, |reason, (code, robots)| reason.with(code.as_str(), robots)))
 }
 
-fn able(view: &FleetProjection, session: &Session, intake: &TaskIntake) -> Result<(), Reason> {
+pub(in crate::fleet) fn able(view: &FleetProjection, session: &Session, intake: &TaskIntake) -> Result<(), Reason> {
     let spec = &intake.spec;
     let has = |c: &str| session.inventory.capabilities.iter().any(|h| h == c);
     let wanted = spec.actions().into_iter().chain(spec.selector.capabilities.iter().map(String::as_str));

@@ -1,0 +1,68 @@
+//! What it costs to give a task to a robot, in thousandths of a millisecond on the way.
+//!
+//! Invariants: integers alone; what a class is worth is more than any way there is, so that a task of a higher class goes
+//! first, and as many tasks are given as can be.
+
+use super::robots::Robot;
+use crate::fleet::assignment::estimate::USUAL_MM_S;
+use crate::planner_policy::PlannerPolicy;
+use crate::task::spec::Class;
+use crate::time::{Now, Utc};
+
+/// Units of a millisecond. What is below only breaks ties.
+const UNITS_PER_MS: i64 = 1_000;
+/// No term counts more than so many milliseconds: 18 hours.
+const TERM_MS_MAX: u64 = 1 << 26;
+/// A robot that failed the task stands behind one that is so much farther away, milliseconds.
+const FAILED_MS: u64 = 60_000;
+
+/// What is known of a task that its cost depends on.
+#[derive(Clone, Copy, Debug)]
+pub struct Urgency {
+    /// Class, after promotions.
+    pub class: Class,
+    /// Since when it is ready.
+    pub since: Utc,
+    /// When it must have ended; none: never.
+    pub deadline: Option<Utc>,
+}
+
+/// What one pair is about.
+#[derive(Clone, Copy, Debug)]
+pub struct Pair {
+    /// From where the robot is free to the task's first goal, millimetres.
+    pub way_mm: u64,
+    /// The robot failed the task before.
+    pub has_failed: bool,
+    /// The task was meant for this robot in the plan before.
+    pub is_meant: bool,
+}
+
+/// What a pair costs before the worth of its class.
+pub fn of_pair(policy: &PlannerPolicy, now: &Now, robot: &Robot, urgency: &Urgency, pair: &Pair) -> i64 {
+    let weight = i64::from(policy.travel_weight(urgency.class));
+    let eta_ms = robot.ready_ms.saturating_add(pair.way_mm * 1_000 / USUAL_MM_S);
+    let failed_ms = if pair.has_failed { FAILED_MS } else { 0 };
+    let age_ms = now.ms_since(urgency.since);
+    let late_ms = urgency.deadline.map_or(0, |at| now.utc.plus_ms(eta_ms).ms_since(at));
+    let meant_ms = if pair.is_meant { policy.hysteresis_ms } else { 0 };
+    weight * units(eta_ms.saturating_add(failed_ms))
+        - units(age_ms) * i64::from(policy.ageing_permille) / 1_000
+        - units(late_ms) * i64::from(policy.lateness_permille) / 1_000
+        - weight * units(meant_ms)
+        + robot.tasks.min(UNITS_PER_MS as u64 - 1) as i64
+}
+
+fn units(ms: u64) -> i64 {
+    ms.min(TERM_MS_MAX) as i64 * UNITS_PER_MS
+}
+
+/// What a task of each class is worth where no pair costs more than `largest`, and at most so many pairs are made.
+pub fn worth(class: Class, largest: i64, pairs: usize) -> i64 {
+    let level = match class {
+        Class::Urgent => 3,
+        Class::Normal => 2,
+        Class::Background => 1,
+    };
+    level * (largest.saturating_add(1)).saturating_mul(2 * pairs as i64)
+}
