@@ -487,8 +487,10 @@ pub const HEADER_LIST_BYTES: u32 = 16 * 1024;
 /// Bytes of one HTTP/2 stream that are composed ahead of a peer that does not read them, however large its window: one frame of the
 /// size that every peer takes.
 pub const STREAM_SEND_BYTES: usize = 16 * 1024;
-/// A connection without a stream for so long is closed. Longer than what people and programs pause between two calls.
-pub const CONNECTION_IDLE: LinkDuration = LinkDuration::from_secs(300);
+/// A connection without a stream for so long is closed. Longer than what people and programs pause between two calls, and no
+/// pause that programs keep (5, 10, 15 minutes) is over at the same moment: a call that meets the end of its connection on
+/// the way fails in clients that do not send it again.
+pub const CONNECTION_IDLE: LinkDuration = LinkDuration::from_secs(420);
 /// A quiet HTTP/2 connection is pinged so often: shorter than what routers forget a connection after.
 pub const KEEPALIVE_EVERY: LinkDuration = LinkDuration::from_secs(20);
 /// A ping that is not answered within this ends the connection: with the pause before it as long as [`AUTHORITY`].

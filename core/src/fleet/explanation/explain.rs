@@ -77,9 +77,11 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
         ))
     });
     let eligible = candidates.iter().any(|c| c.reason.is_none());
-    let awaited = match &intake.spec.robot_id {
-        Some(pinned) => candidates.iter().find(|c| c.robot_id == *pinned).map_or_else(|| absent(pinned), awaited),
-        None => candidates.first().map_or_else(|| "a robot: none has connected".to_owned(), awaited),
+    let meant = view.meant.robot_of(task_id).filter(|robot_id| view.held_by(robot_id).is_some());
+    let awaited = match (&intake.spec.robot_id, meant) {
+        (None, Some(robot_id)) => format!("robot {robot_id}: it is free soon and nearer than others"),
+        (Some(pinned), _) => candidates.iter().find(|c| c.robot_id == *pinned).map_or_else(|| absent(pinned), awaited),
+        (None, None) => candidates.first().map_or_else(|| "a robot: none has connected".to_owned(), awaited),
     };
     let closed = candidates.iter().find_map(|c| barring(c.reason.as_ref())).filter(|_| !eligible).cloned();
     candidates.truncate(CANDIDATES_MAX);

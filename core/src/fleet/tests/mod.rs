@@ -12,6 +12,7 @@ mod maps;
 mod misreads;
 mod opened;
 mod order;
+mod rolling;
 mod unexplained;
 
 use super::projection::{FleetProjection, RevisedRow};
@@ -23,9 +24,9 @@ use crate::reason::Reason;
 use crate::robot::{Inventory, ReportedAttempt, ReportedState, Vitals, WorkState};
 use crate::rows::{Record, Revision, Row};
 use crate::session::Session;
-use crate::site::{CORRIDOR, text};
+use crate::site::{CORRIDOR, Site, text};
 use crate::task::forms::Transport;
-use crate::task::{RawTask, TaskIntake, TaskState};
+use crate::task::{AttemptPhase, RawTask, TaskIntake, TaskState};
 use crate::time::{LinkTime, Now, SiteTime, Utc};
 use std::sync::Arc;
 
@@ -48,7 +49,10 @@ impl Rig {
     }
 
     fn on(site_text: &str) -> Self {
-        let site = Arc::new(text::parse(site_text).expect("a site"));
+        Self::of_site(Arc::new(text::parse(site_text).expect("a site")))
+    }
+
+    fn of_site(site: Arc<Site>) -> Self {
         let begun = Now { utc: Utc(BEGIN.0 - SERVED_MS as i64), wall: BEGIN, ..Now::default() };
         let view = FleetProjection::new(site, begun, begun);
         let now = Now { site: SiteTime(SERVED_MS), link: LinkTime(SERVED_MS), utc: BEGIN, wall: BEGIN, jump: None };
@@ -146,6 +150,15 @@ impl Rig {
         let attempt = attempt.clone();
         let listed = ReportedAttempt { attempt, state, step_index, progress: 1, route_index, opened: false };
         live.report.attempts = vec![listed];
+    }
+
+    /// The robot drives for an attempt, as its row and its report say.
+    fn drives(&mut self, attempt: &AttemptId) {
+        let mut known = self.view.attempts.remove(attempt.to_string().as_str()).expect("a row");
+        known.row.phase = AttemptPhase::Navigating;
+        let robot_id = known.row.robot_id.clone();
+        self.view.attempts.insert(attempt.to_string().into(), known);
+        self.says(&robot_id, attempt, WorkState::Navigating, 0, 1_000);
     }
 
     /// Why a task is where it is.

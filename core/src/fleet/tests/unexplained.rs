@@ -12,7 +12,6 @@ use crate::rows::{Record, Revision, Row};
 use crate::stop::Scope;
 use crate::stop::latch::{Reset, Stop};
 use crate::stop::record::StopRecord;
-use crate::task::AttemptPhase;
 
 /// What is counted in so many seconds in which nobody plans.
 fn counted(rig: &mut Rig, secs: u64) -> Vec<String> {
@@ -80,11 +79,8 @@ fn a_robot_at_the_end_of_its_released_route_that_waits_for_no_place_has_no_reaso
     rig.cycle(Pace::Sweep);
     let task_id = TaskId::parse("T1").expect("an id");
     let id = rig.task("T1").attempt_id().expect("given");
-    let mut attempt = rig.view.attempts.remove(id.to_string().as_str()).expect("a row");
-    attempt.row.phase = AttemptPhase::Navigating;
-    rig.view.attempts.insert(id.to_string().into(), attempt);
+    rig.drives(&id);
     let robot_id = RobotId::parse("r1").expect("an id");
-    rig.says(&robot_id, &id, WorkState::Navigating, 0, 1_000);
     assert_eq!(rig.why(&task_id), None);
     rig.says(&robot_id, &id, WorkState::Executing, 0, 1_000);
     assert_eq!(rig.why(&task_id).map(|why| why.code), Some(Code::WorksOnStep));

@@ -9,13 +9,15 @@ use super::robots::{Free, Robot};
 use crate::fleet::assignment::filters;
 use crate::fleet::decision::slice::Slice;
 use crate::fleet::projection::liveness::Board;
-use crate::fleet::projection::ready::{ByGoal, Need, ReadyTask};
+use crate::fleet::projection::queue::Rank;
+use crate::fleet::projection::ready::Need;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::eligibility;
 use crate::ids::TaskId;
 use crate::planner_policy::PlannerPolicy;
 use crate::site::WaypointIx;
 use crate::site::route::DistanceField;
+use crate::task::TaskIntake;
 use crate::time::Now;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
@@ -52,10 +54,9 @@ pub struct Choices {
     seen: BTreeSet<(usize, usize)>,
 }
 
-/// What a plan knows while it finds pairs.
-pub struct Finder<'a> {
-    /// The projection.
-    pub view: &'a FleetProjection,
+/// What a plan is made of.
+#[derive(Clone, Copy)]
+pub struct Scene<'a> {
     /// Newest heartbeats.
     pub board: &'a Board,
     /// The clocks.
@@ -64,23 +65,29 @@ pub struct Finder<'a> {
     pub policy: &'a PlannerPolicy,
     /// Robots, by id.
     pub robots: &'a [Robot],
-    fields: BTreeMap<WaypointIx, Arc<DistanceField>>,
+}
+
+/// Ready tasks of one need that begin at one goal.
+struct Spot<'a> {
+    field: Option<Arc<DistanceField>>,
+    ranks: &'a BTreeSet<Rank>,
+    need: &'a Arc<Need>,
+}
+
+/// Finds pairs.
+pub struct Finder<'a> {
+    view: &'a FleetProjection,
+    scene: Scene<'a>,
+    spots: Vec<Spot<'a>>,
     /// Robots that have what is needed, by need.
-    able: BTreeMap<Arc<Need>, Vec<bool>>,
+    able: BTreeMap<&'a Arc<Need>, Vec<bool>>,
     found: Choices,
 }
 
 impl<'a> Finder<'a> {
     /// Nothing found yet.
-    pub fn new(
-        view: &'a FleetProjection,
-        board: &'a Board,
-        now: Now,
-        policy: &'a PlannerPolicy,
-        robots: &'a [Robot],
-    ) -> Self {
-        let (fields, able) = (BTreeMap::new(), BTreeMap::new());
-        Self { view, board, now, policy, robots, fields, able, found: Choices::default() }
+    pub fn new(view: &'a FleetProjection, scene: Scene<'a>) -> Self {
+        Self { view, scene, spots: Vec::new(), able: BTreeMap::new(), found: Choices::default() }
     }
 
     /// All pairs that were found.
@@ -91,23 +98,31 @@ impl<'a> Finder<'a> {
     /// Finds the nearest tasks of a robot. False: there is none that it could do.
     pub fn find_tasks(&mut self, robot: usize, slice: &mut Slice) -> bool {
         let view = self.view;
-        let bound = view.ready.bound_to(&self.robots[robot].robot_id).take(NEAREST);
+        if self.spots.is_empty() {
+            let goals = view.ready.by_need().flat_map(|(need, goals)| goals.iter().map(move |goal| (need, goal)));
+            let spot = |(need, (goal, ranks)): (&'a Arc<Need>, (&Option<WaypointIx>, &'a BTreeSet<Rank>))| Spot {
+                field: goal.map(|goal| view.router.field(goal)),
+                ranks,
+                need,
+            };
+            self.spots = goals.map(spot).collect();
+        }
+        let bound = view.ready.bound_to(&self.scene.robots[robot].robot_id).take(NEAREST);
         let mut found = bound.filter(|rank| self.add(robot, &rank.task_id)).count();
-        let mut goals: Vec<(u64, &ByGoal, Option<WaypointIx>)> = Vec::new();
-        for (need, by_goal) in view.ready.by_need() {
-            if !self.is_able(robot, need, by_goal) {
-                continue;
-            }
-            for goal in by_goal.keys() {
-                goals.extend(self.way_mm(robot, *goal).map(|way_mm| (way_mm, by_goal, *goal)));
+        let mut nearest = Vec::new();
+        for nth in 0..self.spots.len() {
+            let Spot { field, ranks, need } = &self.spots[nth];
+            let way_mm = way_mm(field.as_deref(), &self.scene.robots[robot]);
+            if let (Some(way_mm), Some(first), need) = (way_mm, ranks.first(), *need)
+                && self.is_able(robot, need, first)
+            {
+                nearest.push(Reverse((way_mm, nth)));
             }
         }
-        let mut nearest: BinaryHeap<_> =
-            goals.iter().enumerate().map(|(nth, (way_mm, ..))| Reverse((*way_mm, nth))).collect();
+        let mut nearest = BinaryHeap::from(nearest);
         let mut looks = 0;
         while let Some(Reverse((_, nth))) = nearest.pop() {
-            let (_, by_goal, goal) = goals[nth];
-            for rank in by_goal.get(&goal).into_iter().flatten() {
+            for rank in self.spots[nth].ranks {
                 looks += 1;
                 found += usize::from(self.add(robot, &rank.task_id));
                 if found >= NEAREST || looks >= LOOKS_PER_ROBOT {
@@ -123,17 +138,18 @@ impl<'a> Finder<'a> {
     pub fn find_robots(&mut self, task_id: &TaskId, slice: &mut Slice) -> bool {
         let view = self.view;
         let Some(task) = view.ready.get(task_id) else { return false };
+        let field = task.goal.map(|goal| view.router.field(goal));
         let mut near: Vec<Reverse<(u64, usize)>> = Vec::new();
-        for robot in 0..self.robots.len() {
-            let is_for = task.bound_to.as_ref().is_none_or(|bound| *bound == self.robots[robot].robot_id);
+        for (nth, robot) in self.scene.robots.iter().enumerate() {
+            let is_for = task.bound_to.as_ref().is_none_or(|bound| *bound == robot.robot_id);
             if is_for
-                && self.is_able_for(robot, task)
-                && let Some(way_mm) = self.way_mm(robot, task.goal)
+                && self.is_able(nth, &task.need, &task.rank)
+                && let Some(way_mm) = way_mm(field.as_deref(), robot)
             {
-                near.push(Reverse((way_mm + self.robots[robot].ready_ms, robot)));
+                near.push(Reverse((way_mm + robot.ready_ms, nth)));
             }
         }
-        let most = if self.robots.len() > super::ROBOTS_MAX { NEAREST } else { ROBOTS_OF_FIRST };
+        let most = if self.scene.robots.len() > super::ROBOTS_MAX { NEAREST } else { ROBOTS_OF_FIRST };
         let (mut near, mut found, mut looks) = (BinaryHeap::from(near), 0, 0);
         while let Some(Reverse((_, robot))) = near.pop().filter(|_| found < most && looks < 4 * most) {
             looks += 1;
@@ -145,29 +161,30 @@ impl<'a> Finder<'a> {
 
     /// Adds a pair unless something stands against it. Of a robot that is free everything is asked.
     pub fn add(&mut self, robot: usize, task_id: &TaskId) -> bool {
-        let view = self.view;
-        let Some((task, intake)) = view.task(task_id).zip(view.intake(task_id)) else { return false };
-        let Some(ready) = view.ready.get(task_id) else { return false };
+        let (view, Scene { board, now, policy, robots }) = (self.view, self.scene);
         let known = self.found.known.get(task_id).copied();
         if known.is_some_and(|known| self.found.seen.contains(&(robot, known))) {
             return true;
         }
-        let Robot { robot_id, free, .. } = &self.robots[robot];
+        let Some((task, intake)) = view.task(task_id).zip(view.intake(task_id)) else { return false };
+        let Some(ready) = view.ready.get(task_id) else { return false };
+        let Robot { robot_id, free, .. } = &robots[robot];
         let is_fit = match free {
-            Free::Now => filters::pair(view, self.board, robot_id, task, intake, &self.now).is_ok(),
-            Free::Soon if view.meant.is_over(task_id, self.now.site) => false,
-            Free::AfterErrand | Free::Soon => view
-                .sessions
-                .get(robot_id.as_str())
-                .is_some_and(|s| eligibility::fits(view, &s.row, task, intake).is_ok()),
+            Free::Now => filters::pair(view, board, robot_id, task, intake, &now).is_ok(),
+            Free::Soon if view.meant.is_over(task_id, now.site) => false,
+            Free::AfterErrand | Free::Soon => {
+                let session = view.sessions.get(robot_id.as_str());
+                session.is_some_and(|s| eligibility::fits(view, &s.row, task, intake).is_ok())
+            }
         };
-        let Some(way_mm) = self.way_mm(robot, ready.goal).filter(|_| is_fit) else { return false };
-        if known.is_none() && filters::task(view, self.board, task, intake, &self.now).is_err() {
+        let field = ready.goal.map(|goal| view.router.field(goal));
+        let Some(way_mm) = way_mm(field.as_deref(), &robots[robot]).filter(|_| is_fit) else { return false };
+        if known.is_none() && filters::task(view, board, task, intake, &now).is_err() {
             return false;
         }
         let known = known.unwrap_or_else(|| {
-            let urgency = Urgency { class: ready.rank.class, since: ready.rank.since, deadline: intake.spec.deadline };
-            self.found.urgencies.push(urgency);
+            let Rank { class, since, .. } = ready.rank;
+            self.found.urgencies.push(Urgency { class, since, deadline: intake.spec.deadline });
             self.found.tasks.push(task_id.clone());
             self.found.known.insert(task_id.clone(), self.found.tasks.len() - 1);
             self.found.tasks.len() - 1
@@ -178,38 +195,27 @@ impl<'a> Finder<'a> {
             has_failed: task.failed_robots.contains(robot_id),
             is_meant: view.meant.robot_of(task_id) == Some(robot_id),
         };
-        let cost = cost::of_pair(self.policy, &self.now, &self.robots[robot], &self.found.urgencies[known], &pair);
+        let cost = cost::of_pair(policy, &now, &robots[robot], &self.found.urgencies[known], &pair);
         self.found.pairs.push(Choice { robot, task: known, cost });
         true
     }
 
-    fn is_able_for(&mut self, robot: usize, task: &ReadyTask) -> bool {
-        let view = self.view;
-        let robots = self.robots;
-        let able = self.able.entry(task.need.clone()).or_insert_with(|| {
-            let intake = view.intake(&task.rank.task_id);
+    /// Whether a robot has what a task needs, as it has for all tasks of the need.
+    fn is_able(&mut self, robot: usize, need: &'a Arc<Need>, of_task: &Rank) -> bool {
+        let (view, robots) = (self.view, self.scene.robots);
+        let able = self.able.entry(need).or_insert_with(|| {
+            let intake = view.intake(&of_task.task_id);
             robots.iter().map(|robot| intake.is_some_and(|intake| is_able(view, robot, intake))).collect()
         });
         able[robot]
     }
-
-    fn is_able(&mut self, robot: usize, need: &Arc<Need>, by_goal: &ByGoal) -> bool {
-        if let Some(able) = self.able.get(need) {
-            return able[robot];
-        }
-        let first = by_goal.values().find_map(|ranks| ranks.first());
-        let first = first.and_then(|rank| self.view.ready.get(&rank.task_id));
-        first.is_some_and(|first| self.is_able_for(robot, first))
-    }
-
-    /// Millimetres from where the robot is free to a goal; 0 without a goal. None: no way leads there.
-    fn way_mm(&mut self, robot: usize, goal: Option<WaypointIx>) -> Option<u64> {
-        let Some(goal) = goal else { return Some(0) };
-        let field = self.fields.entry(goal).or_insert_with(|| self.view.router.field(goal));
-        field.distance_mm(self.robots[robot].at)
-    }
 }
 
-fn is_able(view: &FleetProjection, robot: &Robot, intake: &crate::task::TaskIntake) -> bool {
+fn is_able(view: &FleetProjection, robot: &Robot, intake: &TaskIntake) -> bool {
     view.sessions.get(robot.robot_id.as_str()).is_some_and(|s| eligibility::able(view, &s.row, intake).is_ok())
+}
+
+/// Millimetres from where the robot is free to a goal; 0 without a goal. None: no way leads there.
+fn way_mm(field: Option<&DistanceField>, robot: &Robot) -> Option<u64> {
+    field.map_or(Some(0), |field| field.distance_mm(robot.at))
 }

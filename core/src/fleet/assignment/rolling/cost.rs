@@ -46,7 +46,7 @@ pub fn of_pair(policy: &PlannerPolicy, now: &Now, robot: &Robot, urgency: &Urgen
     let age_ms = now.ms_since(urgency.since);
     let late_ms = urgency.deadline.map_or(0, |at| now.utc.plus_ms(eta_ms).ms_since(at));
     let meant_ms = if pair.is_meant { policy.hysteresis_ms } else { 0 };
-    weight * units(eta_ms.saturating_add(failed_ms))
+    weight * units(eta_ms.saturating_add(failed_ms).saturating_add(robot.loss_ms))
         - units(age_ms) * i64::from(policy.ageing_permille) / 1_000
         - units(late_ms) * i64::from(policy.lateness_permille) / 1_000
         - weight * units(meant_ms)

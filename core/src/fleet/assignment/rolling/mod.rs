@@ -23,12 +23,12 @@ use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::planner_policy::PlannerPolicy;
 use crate::time::Now;
-use choices::{Choices, Finder};
+use choices::{Choices, Finder, Scene};
 use robots::{Free, Robot};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Robots that are weighed against all tasks at once. Of more of them each task looks for the nearest.
-const ROBOTS_MAX: usize = 256;
+pub const ROBOTS_MAX: usize = 256;
 /// Of so many robots each is weighed for the first tasks in the queue, half as many again.
 const FIRST_PER_TWO_ROBOTS: usize = 3;
 
@@ -41,17 +41,27 @@ pub fn plan(
     policy: &PlannerPolicy,
     plan: &mut Plan,
 ) -> Vec<Candidate> {
-    let mut robots = robots::gather(view, board, &now, policy.horizon_ms);
-    let free = robots.iter().filter(|robot| robot.free != Free::Soon).count();
-    if free > ROBOTS_MAX {
-        robots.retain(|robot| robot.free != Free::Soon || robot.ready_ms == robots::RECALL_MS);
-    } else {
-        keep_first(&mut robots);
+    let free = robots::find_free(view, board, &now);
+    if free.is_empty() {
+        return Vec::new();
     }
-    let is_present = |robot: &&Robot| robot.free != Free::Soon;
-    let present: BTreeSet<RobotId> = robots.iter().filter(is_present).map(|robot| robot.robot_id.clone()).collect();
-    let choices = find_choices(view, board, now, heard, policy, &robots, &present, plan);
-    let pairs = choose(view, board, &now, &robots, choices);
+    let present: BTreeSet<RobotId> = free.iter().map(|robot| robot.robot_id.clone()).collect();
+    let mut robots = robots::find_stopping(view, board);
+    let room = ROBOTS_MAX.saturating_sub(free.len() + robots.len());
+    if room > 0 {
+        let mut soon = robots::find_soon(view, board, &now, policy.horizon_ms);
+        soon.sort_by_key(|robot| robot.ready_ms);
+        robots.extend(soon.into_iter().take(room));
+    }
+    robots.extend(free);
+    robots.sort_by(|a, b| a.robot_id.cmp(&b.robot_id));
+    let scene = Scene { board, now, policy, robots: &robots };
+    let choices = if present.len() > ROBOTS_MAX {
+        find_by_task(view, scene, heard, &present, plan)
+    } else {
+        find_by_robot(view, scene, heard, &present, plan)
+    };
+    let pairs = choose(view, scene, choices);
     let mut taken = BTreeSet::new();
     let mut meant = BTreeMap::new();
     for (robot, task_id) in pairs {
@@ -72,38 +82,26 @@ pub fn plan(
         }
     }
     view.meant.put(meant, now.site);
+    // Those that are left may be near to tasks that were not weighed for them.
+    plan.report.more |= !taken.is_empty() && taken.len() < present.len();
     let left = robots.into_iter().filter(|robot| robot.free == Free::Now && !taken.contains(&robot.robot_id));
     left.map(|robot| Candidate { robot_id: robot.robot_id, at: robot.at, tasks: robot.tasks }).collect()
 }
 
-/// Leaves out robots that are free late, where there are more than are weighed.
-fn keep_first(robots: &mut Vec<Robot>) {
-    let mut order: Vec<usize> = (0..robots.len()).collect();
-    order.sort_by_key(|at| (robots[*at].free == Free::Soon, robots[*at].ready_ms, *at));
-    let kept: BTreeSet<usize> = order.into_iter().take(ROBOTS_MAX).collect();
-    let mut at = 0..;
-    robots.retain(|_| at.next().is_some_and(|at| kept.contains(&at)));
-}
-
-#[expect(clippy::too_many_arguments, reason = "the same of every stage, and what was gathered")]
-fn find_choices(
+/// Of each robot its nearest tasks, and of the first tasks all robots. A robot that found nothing is shown new tasks alone
+/// until it is heard.
+fn find_by_robot(
     view: &mut FleetProjection,
-    board: &Board,
-    now: Now,
+    scene: Scene<'_>,
     heard: &BTreeSet<RobotId>,
-    policy: &PlannerPolicy,
-    robots: &[Robot],
     present: &BTreeSet<RobotId>,
     plan: &mut Plan,
 ) -> Choices {
-    if present.len() > ROBOTS_MAX {
-        return find_by_task(view, board, now, heard, policy, robots, present, plan);
-    }
     let rested = view.queue.rested(present, heard);
     let news = view.queue.take_news();
     let mut nothing = BTreeSet::new();
-    let mut finder = Finder::new(view, board, now, policy, robots);
-    for (robot, Robot { robot_id, .. }) in robots.iter().enumerate() {
+    let mut finder = Finder::new(view, scene);
+    for (robot, Robot { robot_id, .. }) in scene.robots.iter().enumerate() {
         if rested.contains(robot_id) && news.len() <= ROBOTS_MAX {
             for rank in &news {
                 finder.add(robot, &rank.task_id);
@@ -112,7 +110,7 @@ fn find_choices(
             nothing.insert(robot_id.clone());
         }
     }
-    let first = robots.len() * FIRST_PER_TWO_ROBOTS / 2;
+    let first = (present.len() - rested.len()) * FIRST_PER_TWO_ROBOTS / 2;
     let mut found = 0;
     for task_id in view.queue.ready().take(4 * first) {
         plan.report.looked += 1;
@@ -127,21 +125,16 @@ fn find_choices(
 }
 
 /// Where there are more robots than can be weighed against all tasks: of each of the first tasks the nearest robots.
-#[expect(clippy::too_many_arguments, reason = "the same of every stage, and what was gathered")]
 fn find_by_task(
     view: &mut FleetProjection,
-    board: &Board,
-    now: Now,
+    scene: Scene<'_>,
     heard: &BTreeSet<RobotId>,
-    policy: &PlannerPolicy,
-    robots: &[Robot],
     present: &BTreeSet<RobotId>,
     plan: &mut Plan,
 ) -> Choices {
     let mut walk = view.queue.walk(present, heard);
-    let mut finder = Finder::new(view, board, now, policy, robots);
-    let mut found = 0;
-    let mut is_over = false;
+    let mut finder = Finder::new(view, scene);
+    let (mut found, mut is_over) = (0, false);
     while found < limits::DECISIONS_PER_STAGE && !plan.slice.is_spent() {
         let Some(task_id) = view.queue.next(&mut walk) else {
             is_over = true;
@@ -151,30 +144,26 @@ fn find_by_task(
         found += usize::from(finder.find_robots(&task_id, &mut plan.slice));
     }
     let choices = finder.into_choices();
-    // Who is weighed and given nothing walks again; else the walk goes on behind those that nobody could do.
+    // Whoever is weighed and given nothing walks again; only behind tasks that nobody could do a walk goes on.
     match (is_over, found) {
         (true, 0) => plan.report.more |= view.queue.end(&walk, present.clone(), present),
+        (true, _) => {}
         (false, 0) => {
             plan.report.more = true;
             view.queue.pause(walk);
         }
-        (_, _) => plan.report.more = true,
+        (false, _) => plan.report.more = true,
     }
     choices
 }
 
 /// The pairs of least cost, as indices of robots with ids of tasks.
-fn choose(
-    view: &FleetProjection,
-    board: &Board,
-    now: &Now,
-    robots: &[Robot],
-    mut choices: Choices,
-) -> Vec<(usize, TaskId)> {
+fn choose(view: &FleetProjection, scene: Scene<'_>, mut choices: Choices) -> Vec<(usize, TaskId)> {
+    let Scene { board, now, robots, .. } = scene;
     let could = |robot: usize, task_id: &TaskId| {
         let rows = view.task(task_id).zip(view.intake(task_id));
         rows.is_some_and(|(task, intake)| {
-            filters::pair(view, board, &robots[robot].robot_id, task, intake, now).is_ok()
+            filters::pair(view, board, &robots[robot].robot_id, task, intake, &now).is_ok()
         })
     };
     loop {

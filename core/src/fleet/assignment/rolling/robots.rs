@@ -7,13 +7,18 @@ use crate::fleet::assignment::filters;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::traffic::routing;
-use crate::ids::{AttemptId, RobotId};
+use crate::heartbeat::NewestHeartbeat;
+use crate::ids::{AttemptId, RobotId, Subject};
 use crate::site::WaypointIx;
 use crate::task::AttemptPhase;
+use crate::task::state::Errand;
 use crate::time::Now;
 
 /// Breaking off an errand takes about so long, milliseconds: the word there, braking, and the word back.
 pub const RECALL_MS: u64 = 3_000;
+/// A thousandth of charge that a robot does not get now counts as so many milliseconds on the way: from the least charge with
+/// which it may be called to that with which it need not charge these are some 45 s.
+const LOSS_MS_PER_PERMILLE: u64 = 100;
 /// The end of a task and the next offer take about so long, milliseconds.
 const HAND_OVER_MS: u64 = 500;
 
@@ -39,40 +44,65 @@ pub struct Robot {
     pub free: Free,
     /// In so many milliseconds.
     pub ready_ms: u64,
+    /// What it costs beside time to take it from what it does, milliseconds on the way: charge that it does not get.
+    pub loss_ms: u64,
     /// Tasks that it was given so far.
     pub tasks: u64,
 }
 
-/// All robots that are free, or are so within `horizon_ms`, by id.
-pub fn gather(view: &FleetProjection, board: &Board, now: &Now, horizon_ms: u64) -> Vec<Robot> {
+/// Robots that are free, or whose errand may be broken off, by id.
+pub fn find_free(view: &FleetProjection, board: &Board, now: &Now) -> Vec<Robot> {
+    let when = |robot_id: &RobotId| match view.held_by(robot_id) {
+        None => filters::robot(view, board, robot_id, now).is_ok().then_some((Free::Now, 0)),
+        Some(AttemptId { subject: Subject::Task(_), .. }) => None,
+        Some(_) => filters::recallable(view, board, robot_id).then_some((Free::AfterErrand, RECALL_MS)),
+    };
     let robot = |robot_id: &RobotId| {
-        let (free, ready_ms, at) = when_free(view, board, robot_id, now, horizon_ms)?;
-        let tasks = view.control.get(robot_id.as_str()).map_or(0, |c| c.row.tasks);
-        Some(Robot { robot_id: robot_id.clone(), at, free, ready_ms, tasks })
+        let (free, ready_ms) = when(robot_id)?;
+        let live = board.get(robot_id)?;
+        let at = routing::find(view, live.report.vitals.waypoint.as_ref())?;
+        let loss_ms = if free == Free::AfterErrand { loss_ms(view, live, at) } else { 0 };
+        Some(Robot { loss_ms, ..robot(view, robot_id, at, free, ready_ms) })
     };
     board.keys().filter_map(robot).collect()
 }
 
-fn when_free(
-    view: &FleetProjection,
-    board: &Board,
-    robot_id: &RobotId,
-    now: &Now,
-    horizon_ms: u64,
-) -> Option<(Free, u64, WaypointIx)> {
-    let here = || routing::find(view, board.get(robot_id)?.report.vitals.waypoint.as_ref());
-    let Some(attempt) = view.held_by(robot_id) else {
-        return filters::robot(view, board, robot_id, now).is_ok().then(here)?.map(|at| (Free::Now, 0, at));
-    };
-    if view.attempt(attempt)?.errand.is_some() {
-        if filters::recallable(view, board, robot_id) {
-            return here().map(|at| (Free::AfterErrand, RECALL_MS, at));
+/// Robots that break off their errand, by id: each is meant for a task already.
+pub fn find_stopping(view: &FleetProjection, board: &Board) -> Vec<Robot> {
+    let robot = |(robot_id, attempt): (&RobotId, &AttemptId)| {
+        let is_errand = matches!(attempt.subject, Subject::Errand { .. });
+        if !is_errand || view.attempt(attempt)?.phase != AttemptPhase::Stopping {
+            return None;
         }
-        let is_stopping = view.attempt(attempt)?.phase == AttemptPhase::Stopping;
-        return is_stopping.then(here)?.map(|at| (Free::Soon, RECALL_MS, at));
+        let at = routing::find(view, board.get(robot_id)?.report.vitals.waypoint.as_ref())?;
+        Some(robot(view, robot_id, at, Free::Soon, RECALL_MS))
+    };
+    view.robots_at_work().filter_map(robot).collect()
+}
+
+/// Robots whose task ends within `horizon_ms`, by id.
+pub fn find_soon(view: &FleetProjection, board: &Board, now: &Now, horizon_ms: u64) -> Vec<Robot> {
+    let robot = |(robot_id, attempt): (&RobotId, &AttemptId)| {
+        let (ready_ms, at) = ends_soon(view, board, attempt, robot_id, horizon_ms)?;
+        filters::in_work(view, board, robot_id, now).ok()?;
+        Some(robot(view, robot_id, at, Free::Soon, ready_ms))
+    };
+    view.robots_at_work().filter_map(robot).collect()
+}
+
+fn robot(view: &FleetProjection, robot_id: &RobotId, at: WaypointIx, free: Free, ready_ms: u64) -> Robot {
+    let tasks = view.control.get(robot_id.as_str()).map_or(0, |c| c.row.tasks);
+    Robot { robot_id: robot_id.clone(), at, free, ready_ms, loss_ms: 0, tasks }
+}
+
+/// What a robot loses whose charging is broken off.
+fn loss_ms(view: &FleetProjection, live: &NewestHeartbeat, at: WaypointIx) -> u64 {
+    let held = view.held_by(&live.robot_id).and_then(|attempt| view.attempt(attempt));
+    if held.is_none_or(|attempt| attempt.errand != Some(Errand::Charge)) {
+        return 0;
     }
-    let (ready_ms, at) = ends_soon(view, board, attempt, robot_id, horizon_ms)?;
-    filters::in_work(view, board, robot_id, now).is_ok().then_some((Free::Soon, ready_ms, at))
+    let enough = view.policy(&view.site.area_of(at).area_id).charge_opportunistic_permille;
+    u64::from(enough.saturating_sub(live.report.vitals.battery_permille)) * LOSS_MS_PER_PERMILLE
 }
 
 /// When and where the robot ends its task, if nothing is in its way and that is within the horizon.
@@ -83,12 +113,13 @@ fn ends_soon(
     robot_id: &RobotId,
     horizon_ms: u64,
 ) -> Option<(u64, WaypointIx)> {
+    let task_id = attempt.subject.task_id()?;
     let known = view.attempt(attempt)?;
     let is_at_work = matches!(known.phase, AttemptPhase::Navigating | AttemptPhase::Executing | AttemptPhase::Accepted);
     if horizon_ms == 0 || !is_at_work || known.uncertain.is_some() || view.waits.contains_key(robot_id) {
         return None;
     }
-    let (intake, live) = (view.intake(attempt.subject.task_id()?)?, board.get(robot_id)?);
+    let (intake, live) = (view.intake(task_id)?, board.get(robot_id)?);
     let listed = live.report.attempts.iter().find(|listed| listed.attempt == *attempt);
     let step = listed.map_or(known.step_index, |listed| listed.step_index.max(known.step_index));
     let rest = Rest::of_task(view, intake, step as usize, live);

@@ -1,0 +1,201 @@
+//! Which robot gets which task where all are weighed at once.
+
+use super::*;
+use crate::fleet::assignment::rolling;
+use crate::site::grid;
+use crate::task::raw::{RawStep, RawStepKind};
+
+/// A line of cells, `c0` to `c199`, a metre each, that robots drive along at 1 m/s.
+fn line() -> Rig {
+    let map = format!("type octile\nheight 1\nwidth 200\nmap\n{}\n", ".".repeat(200));
+    Rig::of_site(Arc::new(grid::parse_map("line", &map).expect("a map")))
+}
+
+/// Goes to these cells, one after the other.
+fn visits(cells: &[u32]) -> impl FnOnce(&mut RawTask) {
+    let goto = |cell| RawStep { kind: Some(RawStepKind::Goto(format!("c{cell}"))), ..RawStep::default() };
+    let steps = cells.iter().map(goto).collect();
+    |raw| raw.steps = steps
+}
+
+/// Pairs of robot and task of a cycle, by robot.
+fn pairs(plan: &Plan) -> Vec<(String, String)> {
+    let rows = plan.items.iter().flat_map(|item| &item.rows).filter(|row| row.kind == "attempt.offered");
+    let pair = |row: &crate::item::RowChange| {
+        let Write::Put { body, .. } = &row.write else { return None };
+        let attempt: crate::task::Attempt = serde_json::from_str(body).ok()?;
+        Some((attempt.robot_id.to_string(), attempt.attempt.subject.task_id()?.to_string()))
+    };
+    let mut pairs: Vec<_> = rows.filter_map(pair).collect();
+    pairs.sort();
+    pairs
+}
+
+fn named(pairs: &[(&str, &str)]) -> Vec<(String, String)> {
+    pairs.iter().map(|(robot, task)| ((*robot).to_owned(), (*task).to_owned())).collect()
+}
+
+#[test]
+fn all_ways_together_are_the_shortest_not_that_of_the_first_task() {
+    let mut rig = line();
+    rig.robot("left", "c0");
+    rig.robot("right", "c60");
+    // The nearest to the first task is `right`, which then leaves 100 m to the other.
+    rig.submit("first", visits(&[40]));
+    rig.submit("second", visits(&[100]));
+    assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("left", "first"), ("right", "second")]));
+}
+
+#[test]
+fn a_robot_takes_the_task_that_is_near_to_it_unless_another_has_waited_ten_times_as_long_as_the_way() {
+    let mut rig = line();
+    rig.submit("old", visits(&[100]));
+    rig.cycle(Pace::Wake);
+    rig.pass(1_000);
+    rig.submit("near", visits(&[10]));
+    rig.robot("r1", "c0");
+    assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("r1", "near")]));
+    // 90 m further are 180 s of weight, which a tenth of half an hour makes up for; before that it is promoted.
+    let mut rig = line();
+    rig.submit("old", visits(&[40]));
+    rig.cycle(Pace::Wake);
+    rig.pass(800_000);
+    rig.submit("near", visits(&[10]));
+    rig.robot("r1", "c0");
+    assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("r1", "old")]));
+}
+
+#[test]
+fn a_task_of_a_higher_class_goes_first_however_far_it_is() {
+    let mut rig = line();
+    rig.robot("r1", "c0");
+    rig.submit("near", visits(&[1]));
+    rig.submit("urgent", |raw| {
+        visits(&[190])(raw);
+        raw.priority = Some(0);
+    });
+    assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("r1", "urgent")]));
+}
+
+#[test]
+fn as_many_tasks_are_given_as_can_be() {
+    let mut rig = line();
+    rig.robot("r1", "c0");
+    rig.robot("r2", "c50");
+    rig.submit("for-one", |raw| {
+        visits(&[1])(raw);
+        raw.robot_id = "r1".into();
+    });
+    rig.submit("for-all", visits(&[2]));
+    assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("r1", "for-one"), ("r2", "for-all")]));
+}
+
+/// A robot that drives to its only goal, `left_mm` before it, and an idle one that is far away.
+fn one_soon(left_m: u32) -> Rig {
+    let mut rig = line();
+    rig.robot("soon", &format!("c{}", 100 - left_m));
+    rig.submit("at-work", visits(&[100]));
+    assert_eq!(given(&rig.cycle(Pace::Wake).items), ["at-work"]);
+    let robot_id = RobotId::parse("soon").expect("an id");
+    let attempt = rig.view.held_by(&robot_id).expect("an attempt").clone();
+    rig.drives(&attempt);
+    rig.robot("idle", "c10");
+    rig
+}
+
+#[test]
+fn a_task_beside_which_another_robot_is_free_soon_waits_for_that_one() {
+    let mut rig = one_soon(20);
+    rig.submit("beside", visits(&[101]));
+    assert!(pairs(&rig.cycle(Pace::Wake)).is_empty());
+    let task_id = TaskId::parse("beside").expect("an id");
+    assert_eq!(rig.view.meant.robot_of(&task_id).map(ToString::to_string).as_deref(), Some("soon"));
+    // What it is meant for may be long in coming.
+    rig.pass(31_000);
+    assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("idle", "beside")]));
+}
+
+#[test]
+fn a_robot_that_is_not_free_within_the_horizon_counts_for_nothing() {
+    let mut rig = one_soon(40);
+    rig.submit("beside", visits(&[101]));
+    assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("idle", "beside")]));
+}
+
+#[test]
+fn the_order_in_which_tasks_and_robots_came_changes_nothing() {
+    let plan = |order: &[usize]| {
+        let mut rig = line();
+        for nth in order {
+            rig.robot(&format!("r{nth}"), &format!("c{}", nth * 37 % 200));
+        }
+        for nth in order {
+            let cell = (nth * 59 % 200) as u32;
+            rig.submit_as(&format!("T{nth}"), *nth as u64, visits(&[cell]));
+        }
+        pairs(&rig.cycle(Pace::Wake))
+    };
+    let there: Vec<usize> = (0..40).collect();
+    let back: Vec<usize> = there.iter().rev().copied().collect();
+    assert_eq!(plan(&there).len(), 40);
+    assert_eq!(plan(&there), plan(&back));
+}
+
+#[test]
+fn where_there_are_more_robots_than_are_weighed_at_once_every_task_gets_one_near_it() {
+    let mut rig = line();
+    for nth in 0..2 * rolling::ROBOTS_MAX {
+        rig.robot(&format!("r{nth:04}"), &format!("c{}", nth % 200));
+    }
+    for nth in 0..100 {
+        rig.submit(&format!("T{nth:03}"), visits(&[nth]));
+    }
+    let mut all = Vec::new();
+    loop {
+        let plan = rig.cycle(Pace::Wake);
+        all.extend(pairs(&plan));
+        if !plan.report.more {
+            break;
+        }
+    }
+    assert_eq!(all.len(), 100);
+    for (robot, task) in all {
+        let cell = robot[1..].parse::<usize>().expect("a number") % 200;
+        assert_eq!(format!("T{cell:03}"), task, "one stands there");
+    }
+}
+
+#[test]
+fn robots_that_stand_in_one_place_get_a_task_each_in_turn_after_turn() {
+    let mut rig = line();
+    for nth in 0..120 {
+        rig.robot(&format!("r{nth:03}"), "c0");
+        rig.submit(&format!("T{nth:03}"), visits(&[100]));
+    }
+    let mut offers = 0;
+    loop {
+        let plan = rig.cycle(Pace::Wake);
+        offers += plan.report.offers;
+        if !plan.report.more {
+            break;
+        }
+        assert!(plan.report.offers > 0, "a turn that asks for another one did something");
+    }
+    assert_eq!(offers, 120);
+}
+
+#[test]
+fn a_robot_that_none_of_many_tasks_is_for_rests_until_it_is_heard_or_a_task_comes() {
+    let mut rig = line();
+    rig.robot("r1", "c0");
+    for nth in 0..100 {
+        rig.submit(&format!("elsewhere-{nth}"), |raw| {
+            visits(&[nth])(raw);
+            raw.robot_id = "r2".into();
+        });
+    }
+    assert!(rig.cycle(Pace::Sweep).report.looked > 0);
+    assert_eq!(rig.cycle(Pace::Wake).report.looked, 0);
+    rig.submit("mine", visits(&[190]));
+    assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("r1", "mine")]));
+}
