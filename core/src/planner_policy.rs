@@ -77,6 +77,14 @@ impl PlannerPolicy {
         }
     }
 
+    /// Notes every rule that these values break as those of this site, under `field`.
+    pub fn check_for(&self, site_id: &SiteId, field: &str, violations: &mut Violations) {
+        if self.site_id != *site_id {
+            violations.add(format!("{field}.site_id"), format!("must be {site_id}, the site that is served"));
+        }
+        self.check(field, violations);
+    }
+
     /// Notes every rule that these values break, under `field`.
     pub fn check(&self, field: &str, violations: &mut Violations) {
         let mut within = |name: &str, value: u64, least: u64, most: u64, unit: &str| {
@@ -84,13 +92,21 @@ impl PlannerPolicy {
                 violations.add(format!("{field}.{name}"), format!("must be {least}..{most}{unit}"));
             }
         };
-        within("horizon_ms", self.horizon_ms, 0, 60_000, " ms");
+        within("horizon", self.horizon_ms, 0, 60_000, " ms");
         within("urgent_travel_weight", self.urgent_travel_weight.into(), 1, 100, "");
         within("normal_travel_weight", self.normal_travel_weight.into(), 1, 100, "");
         within("background_travel_weight", self.background_travel_weight.into(), 1, 100, "");
         within("ageing_permille", self.ageing_permille.into(), 0, 10_000, " permille");
         within("lateness_permille", self.lateness_permille.into(), 0, 10_000, " permille");
-        within("hysteresis_ms", self.hysteresis_ms, 0, 60_000, " ms");
+        within("hysteresis", self.hysteresis_ms, 0, 60_000, " ms");
+    }
+}
+
+impl Record for PlannerPolicy {
+    const TABLE: Table = Table::PlannerPolicy;
+    body_is_json!();
+    fn id(&self) -> String {
+        self.site_id.to_string()
     }
 }
 
@@ -119,14 +135,19 @@ mod tests {
             ..good
         };
         let fields = [
-            "horizon_ms",
+            "horizon",
             "urgent_travel_weight",
             "normal_travel_weight",
             "background_travel_weight",
             "ageing_permille",
             "lateness_permille",
-            "hysteresis_ms",
+            "hysteresis",
         ];
         assert_eq!(told(&bad), fields.map(|f| format!("policy.{f}")));
+        let mut elsewhere = Violations::default();
+        bad.check_for(&SiteId::parse("yard").expect("an id"), "policy", &mut elsewhere);
+        let told: Vec<_> = elsewhere.0.into_iter().map(|v| v.field).collect();
+        assert_eq!(told[0], "policy.site_id");
+        assert_eq!(told[1..], fields.map(|f| format!("policy.{f}")));
     }
 }

@@ -181,6 +181,7 @@ retention_rules! {
     Place::Table(Table::RobotCounter) => [Machine, Software] Diagnose Month;
     Place::Table(Table::Site) => [Site] Operate Standing;
     Place::Table(Table::AreaPolicy) => [Site] Operate Standing;
+    Place::Table(Table::PlannerPolicy) => [Site] Operate Standing;
     Place::Table(Table::DesiredWork) => [Operations] Operate Newest;
     Place::Table(Table::DesiredPolicy) => [Site] Operate Newest;
     Place::Table(Table::ServiceClock) => [None] Operate Newest;

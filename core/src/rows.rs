@@ -73,6 +73,7 @@ tables! {
     RobotCounter "robot_counter" Fleet, "Work done per robot and software version. id = robot_id@software.";
     Site "site" Fleet, "The site as text and its version. id = site_id.";
     AreaPolicy "area_policy" Fleet, "Live rules of one area. id = area_id.";
+    PlannerPolicy "planner_policy" Fleet, "Live rules of the site's planner. id = site_id.";
     DesiredWork "desired_work" Fleet, "Section `work` of a robot's desired state. id = robot_id.";
     DesiredPolicy "desired_policy" Fleet, "Section `policy` of a robot's desired state. id = robot_id.";
     ServiceClock "service_clock" Fleet, "Serving time of fleet, written with any commit, at most once a second.";

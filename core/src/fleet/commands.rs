@@ -1,5 +1,5 @@
-//! What people ask of fleet directly: cordon, uncordon and retire, a word about a load, rules of an area, clearing a place, closing an
-//! incident. Each is one item, answered after its commit.
+//! What people ask of fleet directly: cordon, uncordon and retire, a word about a load, rules of an area and of the planner, clearing a
+//! place, closing an incident. Each is one item, answered after its commit.
 
 use crate::audit::Note;
 use crate::fleet::decision::incidents;
@@ -67,6 +67,13 @@ pub fn check(
             policy.check("policy", &mut bad);
             bad.finish()?;
             view.policies.get(policy.area_id.as_str()).map_or(Revision(0), |p| p.revision)
+        }
+        Command::PutPlanner(policy) => {
+            let site_id = view.site.site_id();
+            let mut bad = Violations::default();
+            policy.check_for(site_id, "policy", &mut bad);
+            bad.finish()?;
+            view.planner_policies.get(site_id.as_str()).map_or(Revision(0), |p| p.revision)
         }
         Command::ClearPlace { place_id, .. } => {
             let Some(row) = view.places.get(place_id.as_str()) else {
@@ -215,6 +222,9 @@ pub fn note(view: &FleetProjection, command: &Command) -> Note {
         Command::PutPolicy(policy) => {
             Note::new("area.put_policy").about("area", &policy.area_id).with("policy", policy.body())
         }
+        Command::PutPlanner(policy) => {
+            Note::new("planner.put").about("site", &policy.site_id).with("policy", policy.body())
+        }
         Command::ClearPlace { place_id, reason } => {
             let note = Note::new("place.clear").about("place", place_id).because(reason);
             let robots = view.places.get(place_id.as_str()).into_iter().flat_map(|place| &place.row.holders);
@@ -288,6 +298,9 @@ pub fn apply(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
         Command::Undrain { robot_id } => drain::undrain(tx, robot_id),
         Command::PutPolicy(policy) => {
             tx.put_row(policy.clone(), "area.policy_put");
+        }
+        Command::PutPlanner(policy) => {
+            tx.put_row(policy.clone(), "planner.policy_put");
         }
         Command::ClearPlace { place_id, reason } => {
             tx.add_fact(

@@ -350,6 +350,17 @@ CREATE TABLE place_grant (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE planner_policy (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE presence (
     site_id TEXT NOT NULL,
     id TEXT NOT NULL,

@@ -122,6 +122,7 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0100_fleet_event_by_attempt",
     "0101_no_timer_by_ord",
     "0102_no_task_request_by_parent",
+    "0103_planner_policy",
 ];
 
 /// Of `telemetry.db`.

@@ -12,6 +12,7 @@ const WORDS: &[(&str, &[&str])] = &[
         &[
             "AfterStopping",
             "Ask",
+            "AssignmentPolicy",
             "AttemptPhase",
             "DrainState",
             "Duty",

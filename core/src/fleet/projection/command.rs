@@ -2,6 +2,7 @@
 
 use crate::idempotency::IdempotentRequest;
 use crate::ids::{AttemptId, PlaceId, RobotId};
+use crate::planner_policy::PlannerPolicy;
 use crate::policy::AreaPolicy;
 use crate::rows::Table;
 use serde::{Deserialize, Serialize};
@@ -71,6 +72,8 @@ pub enum Command {
     },
     /// New rules of an area, pushed to every robot.
     PutPolicy(AreaPolicy),
+    /// New rules of the site's planner, from its next turn on.
+    PutPlanner(PlannerPolicy),
     /// A person has looked: nobody and nothing is inside.
     ClearPlace {
         /// The place that is empty.

@@ -90,6 +90,8 @@ pub fn permit(view: &FleetProjection, board: &Board, by: &Caller, command: &Comm
             let area_id = &policy.area_id;
             by.authorize_visible(operate, [area_id], || missing(Code::AreaNotFound, "area_id", area_id))
         }
+        // The site's: a right that was given for areas is not enough.
+        Command::PutPlanner(_) => by.authorize(operate, []),
         Command::ClearPlace { place_id, .. } => {
             if !view.places.contains_key(place_id.as_str()) {
                 return Ok(());

@@ -52,6 +52,8 @@ projection! {
         sites: SiteRow = Site;
         /// Rules of areas.
         policies: AreaPolicy = AreaPolicy Indexed;
+        /// Rules of the planner: one row at most.
+        planner_policies: PlannerPolicy = PlannerPolicy;
         /// Section `work` of each robot.
         desired_work: DesiredWork = DesiredWork;
         /// Section `policy` of each robot.
@@ -236,9 +238,12 @@ impl FleetProjection {
         self.holds.range(from.clone()..).take_while(move |(id, _)| id.starts_with(&*from)).map(|(_, h)| &h.row)
     }
 
-    /// Rules of the planner.
+    /// Rules of the planner. Also the default while their row is one of a newer version: robots get work, and a person
+    /// is told of the row.
     pub fn planner(&self) -> PlannerPolicy {
-        PlannerPolicy::default_of(self.site.site_id().clone())
+        let site_id = self.site.site_id();
+        let put = self.planner_policies.get(site_id.as_str()).map(|p| p.row.clone());
+        put.unwrap_or_else(|| PlannerPolicy::default_of(site_id.clone()))
     }
 
     /// Rules of an area, as they are composed for robots and shown to people.

@@ -12,6 +12,7 @@ mod maps;
 mod misreads;
 mod opened;
 mod order;
+mod planner;
 mod rolling;
 mod unexplained;
 

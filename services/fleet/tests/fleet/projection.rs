@@ -22,8 +22,8 @@ fn slots(view: &FleetProjection) -> BTreeMap<&'static str, Vec<String>> {
     macro_rules! told {
         ($($slot:ident)*) => { BTreeMap::from([$((stringify!($slot), view.$slot.iter().map(|r| format!("{r:?}")).collect())),*]) };
     }
-    told!(intakes tasks ended dependants attempts timers holds places authority control counters sites policies desired_work
-        desired_policy clocks marks incidents sessions lane_marks held_places)
+    told!(intakes tasks ended dependants attempts timers holds places authority control counters sites policies planner_policies
+        desired_work desired_policy clocks marks incidents sessions lane_marks held_places)
 }
 
 fn without_empty(mut slots: BTreeMap<&'static str, Vec<String>>) -> BTreeMap<&'static str, Vec<String>> {

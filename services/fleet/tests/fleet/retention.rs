@@ -183,6 +183,7 @@ const STANDING: &[(Table, &str)] = &[
     (Table::RobotAuthority, "one a robot; goes with it"),
     (Table::Site, "one a store"),
     (Table::AreaPolicy, "one an area of a map"),
+    (Table::PlannerPolicy, "one a store"),
     (Table::DesiredWork, "one a robot, written over; goes with it"),
     (Table::DesiredPolicy, "one a robot, written over; goes with it"),
     (Table::ServiceClock, "one a store"),

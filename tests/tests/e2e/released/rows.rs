@@ -11,7 +11,8 @@ use midshift_core::robot_events::InboxEntry;
 use midshift_core::rows::{Entry, Key, Log, Record, Revision, Row, Seq, Table};
 use midshift_core::session::{LaneMark, Session};
 use midshift_core::{
-    audit, desired_state, drain_request, fleet, identity, leadership, policy, presence, rollout, stop, task, update,
+    audit, desired_state, drain_request, fleet, identity, leadership, planner_policy, policy, presence, rollout, stop,
+    task, update,
 };
 use midshift_proto::link::v1::LaneBatch;
 use midshift_proto::{parse, session};
@@ -103,6 +104,7 @@ records! {
     RobotCounter fleet::rows::RobotCounter;
     Site fleet::rows::SiteRow;
     AreaPolicy policy::AreaPolicy;
+    PlannerPolicy planner_policy::PlannerPolicy;
     DesiredWork desired_state::DesiredWork;
     DesiredPolicy desired_state::DesiredPolicy;
     ServiceClock fleet::rows::ServiceClock;
