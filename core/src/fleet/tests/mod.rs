@@ -21,6 +21,7 @@ use super::{Board, Pace, Plan, cycle};
 use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AttemptId, RobotId, TaskId, WaypointId};
 use crate::item::{Item, Write};
+use crate::planner_policy::{AssignmentPolicy, PlannerPolicy};
 use crate::reason::Reason;
 use crate::robot::{Inventory, ReportedAttempt, ReportedState, Vitals, WorkState};
 use crate::rows::{Record, Revision, Row};
@@ -58,6 +59,12 @@ impl Rig {
         let view = FleetProjection::new(site, begun, begun);
         let now = Now { site: SiteTime(SERVED_MS), link: LinkTime(SERVED_MS), utc: BEGIN, wall: BEGIN, jump: None };
         Self { view, board: Board::new(), now, number: 0 }
+    }
+
+    /// The site's planner chooses robots like this.
+    fn plan_as(&mut self, policy: AssignmentPolicy) {
+        let site_id = self.view.site.site_id().clone();
+        self.absorb(&PlannerPolicy { policy, ..PlannerPolicy::default_of(site_id) });
     }
 
     /// A robot that can pick and place, stands at `waypoint` and is heard.

@@ -1,6 +1,7 @@
 //! In which order waiting tasks are served, and what is looked at for it.
 
 use super::*;
+use crate::planner_policy::AssignmentPolicy;
 use crate::reason::Code;
 use crate::task::Phase;
 
@@ -90,6 +91,7 @@ fn what_cannot_run_yet_is_not_looked_at() {
 #[test]
 fn tasks_that_no_idle_robot_may_do_keep_no_later_one_from_its_robot() {
     let mut rig = Rig::new();
+    rig.plan_as(AssignmentPolicy::FifoNearest);
     rig.robot("r1", "park-a");
     for n in 0..3 * LOOKS {
         rig.submit(&format!("elsewhere-{n}"), |raw| raw.robot_id = "r2".into());
@@ -111,6 +113,7 @@ fn tasks_that_no_idle_robot_may_do_keep_no_later_one_from_its_robot() {
 #[test]
 fn a_robot_that_found_nothing_looks_only_at_new_tasks_until_it_is_heard() {
     let mut rig = Rig::new();
+    rig.plan_as(AssignmentPolicy::FifoNearest);
     rig.robot("r1", "park-a");
     for n in 0..100 {
         rig.submit(&format!("elsewhere-{n}"), |raw| raw.robot_id = "r2".into());

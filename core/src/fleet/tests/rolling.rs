@@ -2,7 +2,9 @@
 
 use super::*;
 use crate::fleet::assignment::rolling;
+use crate::rows::Table;
 use crate::site::grid;
+use crate::task::Phase;
 use crate::task::raw::{RawStep, RawStepKind};
 
 /// A line of cells, `c0` to `c199`, a metre each, that robots drive along at 1 m/s.
@@ -20,11 +22,11 @@ fn visits(cells: &[u32]) -> impl FnOnce(&mut RawTask) {
 
 /// Pairs of robot and task of a cycle, by robot.
 fn pairs(plan: &Plan) -> Vec<(String, String)> {
-    let rows = plan.items.iter().flat_map(|item| &item.rows).filter(|row| row.kind == "attempt.offered");
+    let rows = plan.items.iter().flat_map(|item| &item.rows).filter(|row| row.key.table == Table::TaskState);
     let pair = |row: &crate::item::RowChange| {
         let Write::Put { body, .. } = &row.write else { return None };
-        let attempt: crate::task::Attempt = serde_json::from_str(body).ok()?;
-        Some((attempt.robot_id.to_string(), attempt.attempt.subject.task_id()?.to_string()))
+        let task: TaskState = serde_json::from_str(body).ok()?;
+        Some((task.robot_id.filter(|_| task.phase == Phase::Assigned)?.to_string(), task.task_id.to_string()))
     };
     let mut pairs: Vec<_> = rows.filter_map(pair).collect();
     pairs.sort();
