@@ -152,8 +152,6 @@ pub fn place(view: &FleetProjection, row: &Place, revision: Revision) -> v1::Pla
 
 /// Why a task is where it is.
 pub fn task_explanation(task_id: &TaskId, e: &TaskExplanation, now: Utc) -> v1::TaskExplanation {
-    let eligible = e.candidates.iter().filter(|c| c.reason.is_none()).count();
-    let soon = e.position.is_some_and(|p| p <= eligible);
     v1::TaskExplanation {
         task_id: task_id.to_string(),
         position: e.position.map(|p| p as u32),
@@ -172,7 +170,7 @@ pub fn task_explanation(task_id: &TaskId, e: &TaskExplanation, now: Utc) -> v1::
             .iter()
             .map(|(code, n)| v1::FilterCount { code: code.as_str().to_owned(), robots: *n as u32 })
             .collect(),
-        expected_start_time: soon.then(|| timestamp(now)),
+        expected_start_time: e.expected.map(timestamp),
         explain_time: Some(timestamp(now)),
     }
 }

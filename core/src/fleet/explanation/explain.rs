@@ -12,7 +12,7 @@ use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::task::{Phase, TaskState};
-use crate::time::Now;
+use crate::time::{Now, Utc};
 use std::collections::BTreeMap;
 
 /// Candidates listed one by one; the others only by reason.
@@ -40,6 +40,8 @@ pub struct TaskExplanation {
     pub candidates: Vec<RobotCandidate>,
     /// Robots by the first reason against them.
     pub filtered: BTreeMap<Code, u64>,
+    /// UTC, when its robot will be free; now, if as many are eligible as tasks go before it. None: nobody can tell.
+    pub expected: Option<Utc>,
 }
 
 /// Explains one task; none if it is not known or has ended.
@@ -77,13 +79,16 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
         ))
     });
     let eligible = candidates.iter().any(|c| c.reason.is_none());
-    let meant = view.meant.robot_of(task_id).filter(|robot_id| view.held_by(robot_id).is_some());
+    let meant = view.meant.get(task_id).filter(|meant| view.held_by(&meant.robot_id).is_some());
     let awaited = match (&intake.spec.robot_id, meant) {
-        (None, Some(robot_id)) => format!("robot {robot_id}: it is free soon and nearer than others"),
+        (None, Some(meant)) => format!("robot {}: it is free soon and nearer than others", meant.robot_id),
         (Some(pinned), _) => candidates.iter().find(|c| c.robot_id == *pinned).map_or_else(|| absent(pinned), awaited),
         (None, None) => candidates.first().map_or_else(|| "a robot: none has connected".to_owned(), awaited),
     };
     let closed = candidates.iter().find_map(|c| barring(c.reason.as_ref())).filter(|_| !eligible).cloned();
+    let eligible_ones = candidates.iter().filter(|c| c.reason.is_none()).count();
+    let is_next = position.is_some_and(|position| position <= eligible_ones);
+    let expected = meant.map(|meant| meant.free.max(now.utc)).or_else(|| is_next.then_some(now.utc));
     candidates.truncate(CANDIDATES_MAX);
     let code = if eligible { Code::WaitingInQueue } else { Code::WaitingForRobot };
     let turn = || {
@@ -95,7 +100,8 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
     };
     let verdict = wait_reasons::of_task(view, board, now, task, intake).or_else(|| waits.then(turn));
     let verdict = verdict.or_else(|| task.reason.clone());
-    Some(TaskExplanation { position, verdict, candidates, filtered })
+    let expected = expected.filter(|_| position.is_some());
+    Some(TaskExplanation { position, verdict, candidates, filtered, expected })
 }
 
 /// Why each robot with a session gets no work, looked at once for all explanations of a turn.
@@ -114,13 +120,13 @@ pub fn per_turn(robots: usize) -> usize {
 pub fn stored(task: &TaskState) -> TaskExplanation {
     let unread = || Reason::from(Code::WaitingInQueue).with(WAITS_FOR, "the planner: it has not read the task yet");
     let verdict = Some(if task.phase.is_terminal() { wait_reasons::ended(task) } else { unread() });
-    TaskExplanation { position: None, verdict, candidates: Vec::new(), filtered: BTreeMap::new() }
+    TaskExplanation { position: None, verdict, candidates: Vec::new(), filtered: BTreeMap::new(), expected: None }
 }
 
 /// A task one of whose rows holds a value of a newer version.
 pub fn unknown(reason: Reason) -> TaskExplanation {
     let verdict = Some(reason.with(WAITS_FOR, "the newer version of the server"));
-    TaskExplanation { position: None, verdict, candidates: Vec::new(), filtered: BTreeMap::new() }
+    TaskExplanation { position: None, verdict, candidates: Vec::new(), filtered: BTreeMap::new(), expected: None }
 }
 
 /// The robot that a task waits for, and what keeps that one.

@@ -3,7 +3,7 @@
 use super::rows::Timer;
 use crate::ids::{RobotId, TaskId};
 use crate::reason::Code;
-use crate::time::{LinkTime, SiteDuration, SiteTime};
+use crate::time::{LinkTime, SiteDuration, SiteTime, Utc};
 use smol_str::SmolStr;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -46,27 +46,41 @@ pub struct Waiting {
     pub since: crate::time::SiteTime,
 }
 
+/// For whom a ready task is meant.
+#[derive(Clone, Debug)]
+pub struct MeantFor {
+    /// A robot that is free soon.
+    pub robot_id: RobotId,
+    /// UTC, when it is free.
+    pub free: Utc,
+    /// Since when the task is meant for one robot or another.
+    since: SiteTime,
+}
+
 /// Ready tasks that the newest plan means for robots which are free soon. Volatile: no promise.
 #[derive(Clone, Debug, Default)]
-pub struct Meant(BTreeMap<TaskId, (RobotId, SiteTime)>);
+pub struct Meant(BTreeMap<TaskId, MeantFor>);
 
 impl Meant {
     /// A task is meant for no robot for longer than this without getting one, site time.
     const FOR: SiteDuration = SiteDuration::from_secs(30);
 
-    /// The robot that a task is meant for.
-    pub fn robot_of(&self, task_id: &TaskId) -> Option<&RobotId> {
-        self.0.get(task_id).map(|(robot_id, _)| robot_id)
+    /// For whom a task is meant.
+    pub fn get(&self, task_id: &TaskId) -> Option<&MeantFor> {
+        self.0.get(task_id)
     }
     /// Whether a task was meant for one robot or another for so long that it goes to one that is free.
     pub fn is_over(&self, task_id: &TaskId, now: SiteTime) -> bool {
-        self.0.get(task_id).is_some_and(|(_, since)| now.since(*since) > Self::FOR)
+        self.get(task_id).is_some_and(|meant| now.since(meant.since) > Self::FOR)
     }
-    /// What a plan means.
-    pub(in crate::fleet) fn put(&mut self, meant: BTreeMap<TaskId, RobotId>, now: SiteTime) {
+    /// What a plan means: tasks with their robots, and when those are free.
+    pub(in crate::fleet) fn put(&mut self, tasks: Vec<(TaskId, RobotId, Utc)>, now: SiteTime) {
         let before = std::mem::take(&mut self.0);
-        let since = |task_id: &TaskId| before.get(task_id).map_or(now, |(_, since)| *since);
-        self.0 = meant.into_iter().map(|(task_id, robot)| (task_id.clone(), (robot, since(&task_id)))).collect();
+        let meant = |(task_id, robot_id, free): (TaskId, RobotId, Utc)| {
+            let since = before.get(&task_id).map_or(now, |meant| meant.since);
+            (task_id, MeantFor { robot_id, free, since })
+        };
+        self.0 = tasks.into_iter().map(meant).collect();
     }
 }
 

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::fleet::assignment::rolling;
+use crate::fleet::explain;
 use crate::rows::Table;
 use crate::site::grid;
 use crate::task::Phase;
@@ -111,8 +112,13 @@ fn a_task_beside_which_another_robot_is_free_soon_waits_for_that_one() {
     rig.submit("beside", visits(&[101]));
     assert!(pairs(&rig.cycle(Pace::Wake)).is_empty());
     let task_id = TaskId::parse("beside").expect("an id");
-    assert_eq!(rig.view.meant.robot_of(&task_id).map(ToString::to_string).as_deref(), Some("soon"));
-    // What it is meant for may be long in coming.
+    assert_eq!(rig.view.meant.get(&task_id).map(|meant| meant.robot_id.to_string()).as_deref(), Some("soon"));
+    let told = explain::task(&rig.view, &rig.board, &rig.now, &task_id).expect("known");
+    let waits_for = told.verdict.and_then(|why| why.metadata.get("waits_for").cloned());
+    assert_eq!(waits_for.as_deref(), Some("robot soon: it is free soon and nearer than others"));
+    let free = told.expected.expect("an estimate").ms_since(rig.now.utc);
+    assert!((20_000..22_000).contains(&free), "20 m at 1 m/s, and the hand-over: {free}");
+    // The robot that it is meant for may be long in coming.
     rig.pass(31_000);
     assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("idle", "beside")]));
 }

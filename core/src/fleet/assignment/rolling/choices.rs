@@ -193,7 +193,7 @@ impl<'a> Finder<'a> {
         let pair = cost::Pair {
             way_mm,
             has_failed: task.failed_robots.contains(robot_id),
-            is_meant: view.meant.robot_of(task_id) == Some(robot_id),
+            is_meant: view.meant.get(task_id).is_some_and(|meant| meant.robot_id == *robot_id),
         };
         let cost = cost::of_pair(policy, &now, &robots[robot], &self.found.urgencies[known], &pair);
         self.found.pairs.push(Choice { robot, task: known, cost });

@@ -25,7 +25,7 @@ use crate::planner_policy::PlannerPolicy;
 use crate::time::Now;
 use choices::{Choices, Finder, Scene};
 use robots::{Free, Robot};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 /// Robots that are weighed against all tasks at once. Of more of them each task looks for the nearest.
 pub const ROBOTS_MAX: usize = 256;
@@ -63,9 +63,10 @@ pub fn plan(
     };
     let pairs = choose(view, scene, choices);
     let mut taken = BTreeSet::new();
-    let mut meant = BTreeMap::new();
+    let mut meant = Vec::new();
     for (robot, task_id) in pairs {
-        let Robot { robot_id, free, .. } = &robots[robot];
+        let Robot { robot_id, free, ready_ms, .. } = &robots[robot];
+        let is_free_at = now.utc.plus_ms(*ready_ms);
         match free {
             Free::Now => {
                 let Some((task, intake)) = view.task(&task_id).zip(view.intake(&task_id)) else { continue };
@@ -76,9 +77,9 @@ pub fn plan(
             }
             Free::AfterErrand => {
                 plan.decide(view, now, "fleet", |tx| errand_reports::stop_errand(tx, robot_id));
-                meant.insert(task_id, robot_id.clone());
+                meant.push((task_id, robot_id.clone(), is_free_at));
             }
-            Free::Soon => drop(meant.insert(task_id, robot_id.clone())),
+            Free::Soon => meant.push((task_id, robot_id.clone(), is_free_at)),
         }
     }
     view.meant.put(meant, now.site);

@@ -105,7 +105,8 @@ fn loss_ms(view: &FleetProjection, live: &NewestHeartbeat, at: WaypointIx) -> u6
     u64::from(enough.saturating_sub(live.report.vitals.battery_permille)) * LOSS_MS_PER_PERMILLE
 }
 
-/// When and where the robot ends its task, if nothing is in its way and that is within the horizon.
+/// When and where the robot ends its task, if it is on its last way or there, nothing is in its way, and that is within the
+/// horizon.
 fn ends_soon(
     view: &FleetProjection,
     board: &Board,
@@ -122,6 +123,9 @@ fn ends_soon(
     let (intake, live) = (view.intake(task_id)?, board.get(robot_id)?);
     let listed = live.report.attempts.iter().find(|listed| listed.attempt == *attempt);
     let step = listed.map_or(known.step_index, |listed| listed.step_index.max(known.step_index));
+    if intake.spec.goals(step as usize).nth(1).is_some() {
+        return None;
+    }
     let rest = Rest::of_task(view, intake, step as usize, live);
     let ready_ms = rest.usual_ms() + HAND_OVER_MS;
     (ready_ms <= horizon_ms).then_some((ready_ms, rest.ends_at?))
