@@ -2,6 +2,7 @@
 
 use crate::{common, fleet, link, ota, stop, task, telemetry};
 use midshift_core::fleet::rows::{DrainState, HolderState};
+use midshift_core::planner_policy::AssignmentPolicy;
 use midshift_core::presence::Presence;
 use midshift_core::robot::WorkState;
 use midshift_core::robot::{Duty, FaultClass, HardwareStop, Lane, Mode, StopLevel};
@@ -76,6 +77,7 @@ wire_enums! {
         Committing = Committing, RollingBack = RollingBack, Committed = Committed, RolledBack = RolledBack, Refused = Refused, Stuck = Stuck,
     }
     Presence = telemetry::v1::Presence { Online = Online, Suspect = Suspect, Offline = Offline }
+    AssignmentPolicy = fleet::v1::AssignmentPolicy { FifoNearest = FifoNearest, Rolling = Rolling }
     Duty = fleet::v1::Duty { InWork = InWork, Cordoned = Cordoned, BrokenOff = BrokenOff, Retired = Retired }
     RolloutPhase = ota::v1::RolloutPhase {
         Draft = Draft, Validated = Validated, Approved = Approved, Prefetching = Prefetching, Applying = Applying, Soaking = Soaking, Gate = Gate,

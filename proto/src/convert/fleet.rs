@@ -1,8 +1,9 @@
-//! The rules of areas. What else fleet answers is composed from its view, in its service.
+//! The rules of areas and of the planner. What else fleet answers is composed from its view, in its service.
 
-use super::{At, Parse, duration, id, parse_ms, permille, task::etag};
+use super::{At, Parse, WireEnum, duration, id, parse_ms, permille, task::etag, word};
 use crate::fleet::v1;
-use midshift_core::ids::AreaId;
+use midshift_core::ids::{AreaId, SiteId};
+use midshift_core::planner_policy::PlannerPolicy;
 use midshift_core::policy::{AreaPolicy, SoftwareRules, Window};
 use midshift_core::reason::Violations;
 use midshift_core::rows::Revision;
@@ -108,4 +109,61 @@ impl Parse<AreaPolicy> for v1::AreaPolicy {
         policy.check(&at.to_string(), bad);
         (bad.0.len() == before).then_some(policy)
     }
+}
+
+/// The rules of the planner. `revision`: of their row; none if nobody ever put any.
+pub fn encode_planner(policy: &PlannerPolicy, revision: Option<Revision>) -> v1::PlannerPolicy {
+    v1::PlannerPolicy {
+        site_id: policy.site_id.to_string(),
+        etag: revision.map(etag).unwrap_or_default(),
+        policy: Some(policy.policy.to_wire()),
+        horizon: Some(duration(policy.horizon_ms)),
+        urgent_travel_weight: Some(policy.urgent_travel_weight),
+        normal_travel_weight: Some(policy.normal_travel_weight),
+        background_travel_weight: Some(policy.background_travel_weight),
+        ageing_permille: Some(policy.ageing_permille),
+        lateness_permille: Some(policy.lateness_permille),
+        hysteresis: Some(duration(policy.hysteresis_ms)),
+    }
+}
+
+/// Reads the rules of the planner of this site. Absent values take their defaults; all rules are checked, also when one
+/// of them cannot be read. None if and only if something was added to `bad`.
+pub fn parse_planner(
+    wire: v1::PlannerPolicy,
+    site_id: &SiteId,
+    at: At<'_>,
+    bad: &mut Violations,
+) -> Option<PlannerPolicy> {
+    let before = bad.0.len();
+    let default = PlannerPolicy::default_of(site_id.clone());
+    let own = if wire.site_id.is_empty() {
+        Some(site_id.clone())
+    } else {
+        id(&wire.site_id, SiteId::parse, at.field("site_id"), bad)
+    };
+    // A time before none is as far from every rule as can be.
+    let mut ms = |time: Option<prost_types::Duration>, default: u64, name: &'static str| {
+        let ms = parse_ms(time.as_ref(), at.field(name), bad);
+        ms.map_or(default, |ms| u64::try_from(ms).unwrap_or(u64::MAX))
+    };
+    let horizon_ms = ms(wire.horizon, default.horizon_ms, "horizon");
+    let hysteresis_ms = ms(wire.hysteresis, default.hysteresis_ms, "hysteresis");
+    let policy = match wire.policy {
+        None => Some(default.policy),
+        Some(number) => word(number, at.field("policy"), bad),
+    };
+    let policy = PlannerPolicy {
+        site_id: own.unwrap_or(default.site_id),
+        policy: policy.unwrap_or(default.policy),
+        horizon_ms,
+        urgent_travel_weight: wire.urgent_travel_weight.unwrap_or(default.urgent_travel_weight),
+        normal_travel_weight: wire.normal_travel_weight.unwrap_or(default.normal_travel_weight),
+        background_travel_weight: wire.background_travel_weight.unwrap_or(default.background_travel_weight),
+        ageing_permille: wire.ageing_permille.unwrap_or(default.ageing_permille),
+        lateness_permille: wire.lateness_permille.unwrap_or(default.lateness_permille),
+        hysteresis_ms,
+    };
+    policy.check_for(site_id, &at.to_string(), bad);
+    (bad.0.len() == before).then_some(policy)
 }

@@ -115,6 +115,7 @@ fn what_nobody_should_have_to_look_up_is_as_it_was_said() {
         ("/midshift.task.v1.TaskService/CancelTasks", &["dispatcher", "operator"]),
         ("/midshift.task.v1.TaskService/ResolveTasks", &["operator"]),
         ("/midshift.fleet.v1.FleetService/PutAreaPolicy", &["operator"]),
+        ("/midshift.fleet.v1.FleetService/PutPlanner", &["operator"]),
         ("/midshift.identity.v1.IdentityService/CreateToken", &["admin"]),
         ("/midshift.identity.v1.IdentityService/AdoptRobot", &["admin"]),
         ("/midshift.ota.v1.RolloutService/AcceptDeviceKey", &["admin"]),

@@ -1,9 +1,12 @@
-//! Areas' rules there and back.
+//! Rules of areas and of the planner there and back.
 
-use midshift_core::ids::AreaId;
+use midshift_core::ids::{AreaId, SiteId};
+use midshift_core::planner_policy::{AssignmentPolicy, PlannerPolicy};
 use midshift_core::policy::AreaPolicy;
+use midshift_core::reason::Violations;
 use midshift_core::rows::Revision;
-use midshift_proto::convert::fleet::encode_policy;
+use midshift_proto::convert::At;
+use midshift_proto::convert::fleet::{encode_planner, encode_policy, parse_planner};
 use midshift_proto::fleet::v1;
 use midshift_proto::{json::from_json, parse_field};
 use serde_json::json;
@@ -44,4 +47,71 @@ fn a_policy_hears_every_rule_it_breaks() {
     assert_eq!(fields, broken.map(|field| format!("policy.{field}")));
     let refusal = parse_field::<AreaPolicy, v1::AreaPolicy>(None, "policy").expect_err("invalid");
     assert_eq!(refusal.violations[0].field, "policy");
+}
+
+/// Rules of the planner as the site `hall` reads them, or the fields that it refuses.
+fn planner(wire: v1::PlannerPolicy) -> Result<PlannerPolicy, Vec<String>> {
+    let mut bad = Violations::default();
+    let read = parse_planner(wire, &SiteId::parse("hall").expect("an id"), At::top("policy"), &mut bad);
+    read.ok_or_else(|| bad.0.into_iter().map(|violation| violation.field).collect())
+}
+
+#[test]
+fn rules_of_the_planner_take_defaults_for_what_is_absent_and_come_back_whole() {
+    let default = PlannerPolicy::default_of(SiteId::parse("hall").expect("an id"));
+    assert_eq!(planner(v1::PlannerPolicy::default()), Ok(default.clone()));
+    let wire = json!({"siteId": "hall", "policy": "ASSIGNMENT_POLICY_FIFO_NEAREST", "horizon": "0s", "hysteresis": "1.5s",
+        "urgentTravelWeight": 9, "normalTravelWeight": 8, "backgroundTravelWeight": 7, "ageingPermille": 0,
+        "latenessPermille": 6});
+    let put = PlannerPolicy {
+        policy: AssignmentPolicy::FifoNearest,
+        horizon_ms: 0,
+        urgent_travel_weight: 9,
+        normal_travel_weight: 8,
+        background_travel_weight: 7,
+        ageing_permille: 0,
+        lateness_permille: 6,
+        hysteresis_ms: 1_500,
+        ..default
+    };
+    assert_eq!(planner(from_json(wire).expect("json")), Ok(put.clone()));
+    let wire = encode_planner(&put, Some(Revision(3)));
+    assert_eq!(wire.etag, "3");
+    assert_eq!(planner(wire), Ok(put.clone()));
+    assert_eq!(encode_planner(&put, None).etag, "", "nobody ever put any");
+}
+
+#[test]
+fn rules_of_the_planner_hear_every_rule_they_break() {
+    let time = |seconds| Some(prost_types::Duration { seconds, nanos: 0 });
+    let broken = v1::PlannerPolicy {
+        site_id: "yard".to_owned(),
+        policy: Some(0),
+        horizon: time(-1),
+        urgent_travel_weight: Some(0),
+        normal_travel_weight: Some(101),
+        background_travel_weight: Some(u32::MAX),
+        ageing_permille: Some(10_001),
+        lateness_permille: Some(10_001),
+        hysteresis: Some(prost_types::Duration { seconds: 1, nanos: -1 }),
+        ..v1::PlannerPolicy::default()
+    };
+    let fields = [
+        "hysteresis",
+        "policy",
+        "site_id",
+        "horizon",
+        "urgent_travel_weight",
+        "normal_travel_weight",
+        "background_travel_weight",
+        "ageing_permille",
+        "lateness_permille",
+    ];
+    assert_eq!(planner(broken), Err(fields.map(|field| format!("policy.{field}")).to_vec()));
+    for policy in [0, 99] {
+        let wire = v1::PlannerPolicy { policy: Some(policy), ..v1::PlannerPolicy::default() };
+        assert_eq!(planner(wire), Err(vec!["policy.policy".to_owned()]), "{policy}");
+    }
+    let elsewhere = v1::PlannerPolicy { site_id: "Not an id".to_owned(), ..v1::PlannerPolicy::default() };
+    assert_eq!(planner(elsewhere), Err(vec!["policy.site_id".to_owned()]));
 }

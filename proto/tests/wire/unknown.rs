@@ -31,6 +31,7 @@ const FATES: &[(&str, Fate)] = &[
     ("common.v1.Purpose", Fate::Option),
     ("common.v1.Retention", Fate::Option),
     ("common.v1.StopLevel", Fate::NotTaken),
+    ("fleet.v1.AssignmentPolicy", Fate::Refused),
     ("fleet.v1.DrainState", Fate::Shown),
     ("fleet.v1.Duty", Fate::Shown),
     ("fleet.v1.Errand", Fate::Shown),

@@ -14,7 +14,7 @@ use midshift_core::task::{TaskIntake, TaskState};
 use midshift_core::time::Utc;
 use midshift_core::unknown_rows;
 use midshift_proto::access::caller;
-use midshift_proto::convert::fleet::encode_policy;
+use midshift_proto::convert::fleet::{encode_planner, encode_policy, parse_planner};
 use midshift_proto::convert::task::revision_of;
 use midshift_proto::convert::{At, parse_ms, timestamp};
 use midshift_proto::fleet::v1;
@@ -222,6 +222,29 @@ impl FleetService {
         self.act(Command::PutPolicy(policy), by, seen, r.validate_only, request_id).await?;
         let robots = self.query_projection(|view, _, _| view.sessions.len() as u32).await?;
         Ok(v1::PutAreaPolicyResponse { policy: Some(self.policy(area_id, by).await?), robots })
+    }
+
+    async fn planner(&self, by: &Caller) -> Result<v1::PlannerPolicy, Refusal> {
+        by.authorize(Permission::Read, [])?;
+        self.query_projection(|view, _, _| {
+            let revision = view.planner_policies.get(view.site.site_id().as_str()).map(|p| p.revision);
+            encode_planner(&view.planner(), revision)
+        })
+        .await
+    }
+
+    async fn change_planner(&self, r: v1::PutPlannerRequest, by: &Caller) -> Result<v1::PutPlannerResponse, Refusal> {
+        let mut bad = Violations::default();
+        let request_id = request_id(&r.request_id, &mut bad);
+        let wire = r.policy.unwrap_or_else(|| {
+            bad.add("policy", "is required");
+            v1::PlannerPolicy::default()
+        });
+        let seen = revision_of(&wire.etag);
+        let policy = parse_planner(wire, self.site.site_id(), At::top("policy"), &mut bad);
+        bad.finish()?;
+        self.act(Command::PutPlanner(policy.ok_or_else(internal)?), by, seen, r.validate_only, request_id).await?;
+        Ok(v1::PutPlannerResponse { policy: Some(self.planner(by).await?) })
     }
 
     async fn places(&self, r: v1::ListPlacesRequest, by: &Caller) -> Result<v1::ListPlacesResponse, Refusal> {
@@ -478,6 +501,14 @@ impl Face for FleetService {
     ) -> Result<Response<v1::PutAreaPolicyResponse>, Status> {
         let by = caller(&r);
         answer(self.put_policy(r.into_inner(), &by).await)
+    }
+    async fn get_planner(&self, r: Request<v1::GetPlannerRequest>) -> Result<Response<v1::GetPlannerResponse>, Status> {
+        let policy = self.planner(&caller(&r)).await;
+        answer(policy.map(|policy| v1::GetPlannerResponse { policy: Some(policy) }))
+    }
+    async fn put_planner(&self, r: Request<v1::PutPlannerRequest>) -> Result<Response<v1::PutPlannerResponse>, Status> {
+        let by = caller(&r);
+        answer(self.change_planner(r.into_inner(), &by).await)
     }
     async fn list_places(&self, r: Request<v1::ListPlacesRequest>) -> Result<Response<v1::ListPlacesResponse>, Status> {
         let by = caller(&r);

@@ -19,6 +19,7 @@ mod offers;
 mod old_site;
 mod people;
 mod places;
+mod planner;
 mod projection;
 mod races;
 mod reach;
