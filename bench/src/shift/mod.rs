@@ -10,9 +10,10 @@
 //!
 //! Left out are the port, identity, stops, roll-outs, and housekeeping: a shift is shorter than what any of it keeps.
 //!
-//! Modules, from the lowest to the highest: `clock`, `task_records`, `plan_log`, `link`, `robot`, `control_plane`, `floor`,
-//! `workload`, `scenario`, `progress`, `run`, `measures`, `chart`.
+//! Modules, from the lowest to the highest: `background_task`, `clock`, `task_records`, `plan_log`, `link`, `robot`,
+//! `control_plane`, `floor`, `workload`, `scenario`, `progress`, `run`, `measures`, `chart`.
 
+mod background_task;
 mod chart;
 mod clock;
 mod control_plane;

@@ -2,6 +2,7 @@
 //!
 //! Invariant: one thread, one time, one seed; nothing reads the wall but what measures it.
 
+use super::background_task::panic_message;
 use super::clock::VirtualClock;
 use super::control_plane::ControlPlane;
 use super::floor::Floor;
@@ -11,6 +12,7 @@ use super::robot::{Robot, RobotConfig};
 use super::scenario::{BodyFaults, Scenario};
 use super::task_records::{TaskCounts, TaskRecord, TaskRecords};
 use super::workload::Client;
+use anyhow::bail;
 use midshift_core::ids::TaskId;
 use midshift_core::time::Clock;
 use midshift_sim::faults::FaultRates;
@@ -18,6 +20,7 @@ use midshift_sim::fleet::{Fleet, FleetConfig, FleetReport};
 use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use tokio::task::JoinSet;
 
 /// The fleet is looked at this often, and the person who looks after broken robots goes round.
 const LOOK: Duration = Duration::from_secs(5);
@@ -85,7 +88,8 @@ pub struct Outcome {
 /// Runs one shift.
 ///
 /// # Errors
-/// A task that is refused, a fleet that the site has no room for, or a store that cannot be read.
+/// A task that is refused, a fleet that the site has no room for, a store that cannot be read, or a service or a robot
+/// that fails.
 pub fn run(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     let begun = wall();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build()?;
@@ -105,10 +109,11 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     let mut plane =
         ControlPlane::open(floor.site.clone(), floor.text.clone(), clock.clone(), records.clone(), config.turn).await?;
     let fleet = Arc::new(open_fleet(config, &clock)?);
+    let mut robots = JoinSet::new();
     for (number, body) in (0..).zip(fleet.robots()) {
         let (telemetry, heartbeat) = (plane.telemetry.clone(), config.heartbeat);
         let robot = Robot::new(body.clone(), clock.clone(), telemetry, RobotConfig { delay: config.delay, heartbeat });
-        tokio::spawn(robot.run(SWITCHED_ON * number));
+        robots.spawn(robot.run(SWITCHED_ON * number));
     }
     tokio::time::sleep(WORK_BEGINS + SWITCHED_ON * config.robots as u32).await;
     let source = floor.tasks(config.seed)?;
@@ -122,6 +127,10 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
         tokio::select! {
             biased;
             ended = &mut asking => ended?,
+            failed = plane.await_failure() => return Err(failed),
+            Some(ended) = robots.join_next() => {
+                bail!("a robot ended: {}", ended.err().map_or_else(|| "by itself".to_owned(), panic_message));
+            }
             () = tokio::time::sleep(LOOK) => {
                 let now = clock.now().site;
                 samples.push(Sample { at_ms: clock.elapsed_ms(), counts: records.counts() });
@@ -131,7 +140,7 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
                 }
                 if let Some(stop) = &config.scenario.planner_stop {
                     let is_away = stop.contains(&Duration::from_millis(clock.elapsed_ms()));
-                    if is_away { plane.stop_planner().await } else { plane.start_planner() }
+                    if is_away { plane.stop_planner().await? } else { plane.start_planner() }
                 }
             }
         }
