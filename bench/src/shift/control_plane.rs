@@ -101,6 +101,11 @@ impl ControlPlane {
         self.planner = Some(Planner { task, _face: face });
     }
 
+    /// Whether nobody plans.
+    pub fn is_planner_away(&self) -> bool {
+        self.planner.is_none()
+    }
+
     /// Ends fleet's reconciler, as when its process is stopped.
     ///
     /// # Errors

@@ -6,8 +6,9 @@ use super::background_task::panic_message;
 use super::clock::VirtualClock;
 use super::control_plane::ControlPlane;
 use super::floor::Floor;
+use super::operator::Operator;
 use super::plan_log::PlansNoted;
-use super::progress::ProgressWatch;
+use super::progress::{NoProgress, Planning, ProgressWatch};
 use super::robot::{Robot, RobotConfig};
 use super::scenario::{BodyFaults, Scenario};
 use super::task_records::{TaskCounts, TaskRecord, TaskRecords};
@@ -17,6 +18,7 @@ use midshift_core::ids::TaskId;
 use midshift_core::time::Clock;
 use midshift_sim::faults::FaultRates;
 use midshift_sim::fleet::{Fleet, FleetConfig, FleetReport};
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -48,8 +50,19 @@ pub struct ShiftConfig {
     pub heartbeat: Option<Duration>,
     /// Turning on the spot takes a body time.
     pub turns: bool,
+    /// A person answers tasks in NEEDS_OPERATOR.
+    pub answers: Answers,
     /// What is asked for, and what goes wrong.
     pub scenario: Scenario,
+}
+
+/// Whether a person is at the screen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Answers {
+    /// Tasks in NEEDS_OPERATOR stay there.
+    None,
+    /// They are answered after some minutes.
+    Given,
 }
 
 /// The fleet at one moment.
@@ -75,14 +88,25 @@ pub struct Outcome {
     pub plans: PlansNoted,
     /// What the bodies did, and whether they broke a rule.
     pub bodies: FleetReport,
-    /// Robots with a task that came on with nothing, summed up.
-    pub no_progress: Duration,
+    /// Robots with a task that came on with nothing.
+    pub no_progress: NoProgress,
     /// The fleet over time.
     pub samples: Vec<Sample>,
     /// When the planner was away.
     pub planner_stop: Option<Range<Duration>>,
     /// Time that the run took by the wall.
     pub wall: Duration,
+}
+
+impl Outcome {
+    /// Tasks that were open at the end, by where they were and why.
+    pub fn open_tasks(&self) -> BTreeMap<(&'static str, &'static str), usize> {
+        let mut open = BTreeMap::new();
+        for task in self.tasks.iter().filter(|task| !task.phase.is_terminal()) {
+            *open.entry((task.phase.as_str(), task.reason.unwrap_or_default())).or_default() += 1;
+        }
+        open
+    }
 }
 
 /// Runs one shift.
@@ -120,6 +144,14 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     let client = Client::new(plane.tasks.clone(), source, records.clone(), clock.clone(), config.seed);
     let asking = client.run(config.scenario.demand, config.robots);
     tokio::pin!(asking);
+    let operator = Operator::new(plane.tasks.clone(), fleet.clone(), records.clone(), clock.clone(), config.seed);
+    let answering = async {
+        match config.answers {
+            Answers::Given => operator.run().await,
+            Answers::None => std::future::pending().await,
+        }
+    };
+    tokio::pin!(answering);
     let mut progress = ProgressWatch::new(fleet.clone(), records.clone());
     let mut samples = Vec::new();
     let lasts_ms = config.lasts.as_millis() as u64;
@@ -127,6 +159,7 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
         tokio::select! {
             biased;
             ended = &mut asking => ended?,
+            ended = &mut answering => ended?,
             failed = plane.await_failure() => return Err(failed),
             Some(ended) = robots.join_next() => {
                 bail!("a robot ended: {}", ended.err().map_or_else(|| "by itself".to_owned(), panic_message));
@@ -134,7 +167,8 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
             () = tokio::time::sleep(LOOK) => {
                 let now = clock.now().site;
                 samples.push(Sample { at_ms: clock.elapsed_ms(), counts: records.counts() });
-                progress.look_at_robots(now);
+                let is_away = plane.is_planner_away();
+                progress.look_at_robots(now, if is_away { Planning::Stopped } else { Planning::Goes });
                 if config.scenario.faults == BodyFaults::Usual {
                     fleet.person_round(now, &|task_id: &TaskId| records.is_worked_on(task_id));
                 }
