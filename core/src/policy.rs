@@ -138,7 +138,7 @@ pub struct AreaPolicy {
     pub charge_opportunistic_permille: u16,
     /// Charging ends here, permille.
     pub charge_stop_permille: u16,
-    /// Above this a charging robot may be called to work, permille.
+    /// Above this a charging robot may be called to work, permille; at 1000 none is.
     pub charge_preemptible_permille: u16,
     /// Milliseconds of link time after which what a robot says of itself, and an open breaker, is an incident: see [`crate::fleet::explanation::lasting`].
     #[serde(default = "incident_after_ms")]
@@ -179,14 +179,16 @@ impl AreaPolicy {
         let order = [
             ("charge_mandatory_permille", 50, self.charge_mandatory_permille),
             ("charge_preemptible_permille", self.charge_mandatory_permille, self.charge_preemptible_permille),
-            ("charge_opportunistic_permille", self.charge_preemptible_permille, self.charge_opportunistic_permille),
+            ("charge_opportunistic_permille", self.charge_mandatory_permille, self.charge_opportunistic_permille),
             ("charge_stop_permille", self.charge_opportunistic_permille, self.charge_stop_permille),
         ];
         for (name, least, value) in order {
             if value < least || value > 1_000 {
                 violations.add(
                     format!("{field}.{name}"),
-                    format!("must be {least}..1000 permille (mandatory <= preemptible <= opportunistic <= stop)"),
+                    format!(
+                        "must be {least}..1000 permille (mandatory <= preemptible, mandatory <= opportunistic <= stop)"
+                    ),
                 );
             }
         }

@@ -16,6 +16,25 @@ const AIR_C: f64 = 24.0;
 /// How fast joints warm and cool, seconds.
 const JOINT_TAU_S: f64 = 300.0;
 
+/// How the rates of a body's battery differ from the model's.
+///
+/// The planner filters by the model alone: it keeps a tenth of what a trip costs, and a tenth of the battery. A test
+/// holds that this covers draws of up to 1,700.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct EnergyScale {
+    /// Energy taken from the battery, thousandths of the model's.
+    pub draw_permille: u32,
+    /// Energy that a charger gives, thousandths of the usual.
+    pub charge_permille: u32,
+}
+
+impl Default for EnergyScale {
+    /// The model itself.
+    fn default() -> Self {
+        Self { draw_permille: 1_000, charge_permille: 1_000 }
+    }
+}
+
 /// What a body does over a stretch of time, as far as energy is concerned.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Effort {
@@ -29,8 +48,10 @@ pub struct Effort {
     pub parked: bool,
     /// It hangs on a charger.
     pub charging: bool,
-    /// What its software makes of the energy it needs, thousandths.
+    /// What its software and its build make of the energy it needs, thousandths.
     pub draw_permille: u32,
+    /// What a charger gives of the usual, thousandths.
+    pub charge_permille: u32,
     /// What its software adds to the heat of its hottest joint, degrees Celsius per second.
     pub climb_c_s: f64,
 }
@@ -45,6 +66,7 @@ impl Default for Effort {
             parked: false,
             charging: false,
             draw_permille: 1000,
+            charge_permille: 1000,
             climb_c_s: 0.0,
         }
     }
@@ -58,6 +80,10 @@ impl Effort {
         let drive_w = self.speed_m_s * DRIVE_MWH_PER_M * factor * 3.6;
         let all_w = stand_w + drive_w + if self.acting { ACT_W } else { 0.0 };
         all_w * (f64::from(self.draw_permille) / 1000.0)
+    }
+    /// Watts that a charger gives the battery, beside what the body draws meanwhile.
+    fn charge_w(&self) -> f64 {
+        CHARGE_W * f64::from(self.charge_permille) / 1000.0
     }
     /// Degrees Celsius where the hottest joint would come to rest.
     fn warms_to_c(&self) -> f64 {
@@ -95,7 +121,7 @@ impl Stores {
         let spent_mwh = effort.draw_w() * 1000.0 * hours;
         self.spent_mwh += spent_mwh;
         if self.drains {
-            let in_mwh = if effort.charging { (CHARGE_W + effort.draw_w()) * 1000.0 * hours } else { 0.0 };
+            let in_mwh = if effort.charging { (effort.charge_w() + effort.draw_w()) * 1000.0 * hours } else { 0.0 };
             self.charge_mwh = (self.charge_mwh - spent_mwh + in_mwh).clamp(0.0, CAPACITY_MWH);
         }
         let rest_c = effort.warms_to_c();
@@ -132,6 +158,8 @@ mod tests {
         assert_eq!(stores.charge_permille(), 1000);
         assert_eq!(stores.after(SiteDuration::from_secs(600), &charging).charge_permille(), 1000);
         assert!(Stores::new(0, true).after(SiteDuration::from_secs(20 * 60), &charging).charge_permille() == 500);
+        let faster = Effort { charge_permille: 2_000, draw_permille: 3_000, ..charging };
+        assert_eq!(Stores::new(0, true).after(SiteDuration::from_secs(10 * 60), &faster).charge_permille(), 500);
     }
 
     #[test]

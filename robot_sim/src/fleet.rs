@@ -5,6 +5,7 @@
 //! own, so that its process may die alone. Called by the swarm, the simulator's service and the report of `dev`.
 
 use crate::body::{self, BodyConfig, Counts, JOURNAL_FILE, SimBody};
+use crate::energy::EnergyScale;
 use crate::faults::{FaultRates, Injected};
 use crate::handle::SimHandle;
 use crate::journal;
@@ -12,7 +13,7 @@ use crate::judge::{Judge, Verdict};
 use crate::person::{Deed, Person};
 use crate::world::{SharedWorld, World, WorldConfig, lock};
 use midshift_core::ids::{RobotId, TaskId, WaypointId};
-use midshift_core::site::{Site, Source, WaypointIx};
+use midshift_core::site::{Kind, Site, Source, WaypointIx};
 use midshift_core::time::{Now, SiteTime};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -76,6 +77,8 @@ pub struct FleetConfig {
     pub faults: FaultRates,
     /// Batteries empty by work.
     pub drains: bool,
+    /// How fast they do, and how fast a charger fills them.
+    pub energy: EnergyScale,
     /// Turning on the spot takes time.
     pub turns: bool,
     /// What a pick does not find is made on the spot.
@@ -101,6 +104,7 @@ impl FleetConfig {
             prefix: "rbt-".to_owned(),
             faults: FaultRates::default(),
             drains: true,
+            energy: EnergyScale::default(),
             turns: true,
             auto_stock: true,
             crowded: false,
@@ -115,13 +119,14 @@ impl FleetConfig {
         let name = format!("{}{:0digits$}", self.prefix, index + 1);
         RobotId::parse(&name).map_err(|source| Error::Prefix { prefix: self.prefix.clone(), source })
     }
-    /// Where each robot of the site starts. On a grid: seeded, each on a cell of its own.
+    /// Where each robot of the site starts. On a grid: seeded, each on a cell of its own that is no charger.
     pub fn starting_waypoints(&self) -> Result<Vec<WaypointId>, Error> {
         let site = &self.site;
         let mut seats = match &self.starts {
             Some(starts) => starts.clone(),
             None if site.source() == Source::Grid && site.starts().is_empty() => {
-                let mut cells: Vec<_> = (0..site.waypoints().len() as u32).map(WaypointIx).collect();
+                let cells = (0..site.waypoints().len() as u32).map(WaypointIx);
+                let mut cells: Vec<_> = cells.filter(|at| site.waypoint(*at).kind != Kind::Charger).collect();
                 cells.shuffle(&mut ChaCha8Rng::seed_from_u64(self.seed ^ 0x6772_6964));
                 cells
             }
@@ -195,10 +200,11 @@ impl Fleet {
         };
         for (index, start) in starts.into_iter().enumerate().filter(|(i, _)| part.contains(i)) {
             let robot_id = config.robot_id(index)?;
-            let FleetConfig { faults, drains, turns, pace_permille, .. } = *config;
+            let FleetConfig { faults, drains, energy, turns, pace_permille, .. } = *config;
             let of_body = BodyConfig {
                 faults,
                 drains,
+                energy,
                 turns,
                 pace_permille,
                 ..BodyConfig::new(robot_id.clone(), config.seed, start)

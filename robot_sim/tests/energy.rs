@@ -1,7 +1,8 @@
 //! What the planner expects a trip to cost, and what it costs a simulated body.
 
 use midshift_agent::body::{Body, BodyNews, BodyOrder, PathPoint};
-use midshift_core::energy::Trip;
+use midshift_core::energy::{CAPACITY_MWH, Trip};
+use midshift_core::fleet::assignment::filters::RESERVE_PERMILLE;
 use midshift_core::ids::{RobotId, TaskId, WaypointId};
 use midshift_core::limits::STOP_SLOW_MM_S;
 use midshift_core::site::route::Router;
@@ -9,6 +10,7 @@ use midshift_core::site::{DEMO, Site, WaypointIx, text};
 use midshift_core::step::StepKind;
 use midshift_core::time::SiteTime;
 use midshift_sim::body::{BodyConfig, SPEED_MAX_MM_S, SimBody};
+use midshift_sim::energy::EnergyScale;
 use midshift_sim::faults::FaultRates;
 use midshift_sim::world::{World, WorldConfig};
 use rand::rngs::StdRng;
@@ -20,6 +22,9 @@ use std::sync::Arc;
 const SEEDS: u64 = 200;
 /// Robots at their fastest may spend so much less than was planned, times: planned is the slowest way.
 const ABOVE_MAX: f64 = 2.0;
+
+/// A draw for which the planner's reserve is enough by far, thousandths of the model's.
+const HUNGRY_PERMILLE: u32 = 1_700;
 
 /// What a trip was expected to cost, and what it did, milliwatt-hours.
 struct Cost {
@@ -36,7 +41,7 @@ struct Driver {
 }
 
 impl Driver {
-    fn new(seed: u64) -> Self {
+    fn new(seed: u64, draw_permille: u32) -> Self {
         let site = Arc::new(text::parse(DEMO).expect("the demo floor is a site"));
         let mut rng = StdRng::seed_from_u64(seed);
         let start = site.waypoints().choose(&mut rng).expect("waypoints").waypoint_id.clone();
@@ -44,6 +49,7 @@ impl Driver {
         let config = BodyConfig {
             faults: FaultRates::none(),
             battery_permille: Some(1_000),
+            energy: EnergyScale { draw_permille, ..EnergyScale::default() },
             ..BodyConfig::new(RobotId::parse("rbt-01").expect("a name"), seed, start)
         };
         let body = SimBody::new(config, site.clone(), world, SiteTime(0)).expect("a body");
@@ -97,8 +103,8 @@ fn action(name: &str) -> StepKind {
 }
 
 /// Transports, inspections and waits, one after the other.
-fn trip(seed: u64) -> Cost {
-    let mut driver = Driver::new(seed);
+fn trip(seed: u64, draw_permille: u32) -> Cost {
+    let mut driver = Driver::new(seed, draw_permille);
     let mut trip = Trip::new(false, None);
     let slowest = seed.is_multiple_of(4);
     driver.body.work_for(Some(&TaskId::parse("T1").expect("a task")), 0);
@@ -123,9 +129,19 @@ fn trip(seed: u64) -> Cost {
 #[test]
 fn no_trip_of_a_simulated_body_costs_more_than_was_planned_nor_far_less() {
     for seed in 0..SEEDS {
-        let Cost { planned, spent } = trip(seed);
+        let Cost { planned, spent } = trip(seed, 1_000);
         assert!(spent <= planned, "seed {seed}: {spent} mWh were spent, {planned} planned");
         let above = planned as f64 / spent as f64;
         assert!(above <= ABOVE_MAX, "seed {seed}: {planned} mWh were planned, {above:.2} times the {spent} spent");
+    }
+}
+
+#[test]
+fn a_hungry_body_spends_more_than_was_planned_and_never_the_reserve() {
+    let reserve = CAPACITY_MWH as u64 * RESERVE_PERMILLE / 1_000;
+    let costs: Vec<Cost> = (0..SEEDS).map(|seed| trip(seed, HUNGRY_PERMILLE)).collect();
+    assert!(costs.iter().any(|cost| cost.spent > cost.planned), "the margin alone is not enough");
+    for Cost { planned, spent } in costs {
+        assert!(spent <= planned + reserve / 4, "{spent} mWh were spent, {planned} planned");
     }
 }

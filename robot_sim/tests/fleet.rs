@@ -71,6 +71,9 @@ fn on_a_grid_robots_start_on_seeded_cells_of_their_own() {
     assert_eq!(starts(1).iter().collect::<BTreeSet<_>>().len(), 6);
     assert_eq!(starts(1), starts(1));
     assert_ne!(starts(1), starts(2));
+    let charged = Arc::new(grid::parse_map("small", &map.replace("map\n.", "map\nC")).expect("a grid"));
+    let all = FleetConfig { seed: 1, ..config(charged, 9) }.starting_waypoints().expect("seats");
+    assert!(all.iter().all(|at| at.as_str() != "c0"), "a charger is nobody's start: {all:?}");
 }
 
 #[test]

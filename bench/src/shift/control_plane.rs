@@ -2,6 +2,7 @@
 //!
 //! Left out are what serves no work: the port, identity, roll-outs, stops, housekeeping, and the files of a disk.
 
+use super::background_task::BackgroundTask;
 use super::clock::VirtualClock;
 use super::plan_log::PlanLog;
 use super::task_records::TaskRecords;
@@ -14,7 +15,6 @@ use midshift_task::TaskService;
 use midshift_telemetry::TelemetryService;
 use std::sync::Arc;
 use std::time::Duration;
-use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
 /// Bytes of STATUS that are kept: nobody reads it.
@@ -24,8 +24,7 @@ const LOG_ENTRIES: usize = 20_000;
 
 /// A planner that runs.
 struct Planner {
-    ends: CancellationToken,
-    task: JoinHandle<()>,
+    task: BackgroundTask,
     /// A planner ends once nobody can ask it any more.
     _face: FleetService,
 }
@@ -42,6 +41,7 @@ pub struct ControlPlane {
     site_text: String,
     clock: Arc<VirtualClock>,
     board: Arc<LiveBoard<NewestHeartbeat>>,
+    sessions: BackgroundTask,
     planner: Option<Planner>,
 }
 
@@ -73,10 +73,11 @@ impl ControlPlane {
             bugs: Default::default(),
         };
         let telemetry = TelemetryService::new(parts, CancellationToken::new());
-        tokio::spawn(telemetry.clone().run());
+        let running = telemetry.clone().run();
+        let sessions = BackgroundTask::spawn("telemetry", |_| async move { Ok(running.await?) });
         let parts = midshift_task::Parts { store, site: site.clone(), clock: any_clock, bugs: Default::default() };
         let tasks = TaskService::open(parts, CancellationToken::new()).await?;
-        let mut plane = Self { tasks, telemetry, plan_log, site, site_text, clock, board, planner: None };
+        let mut plane = Self { tasks, telemetry, plan_log, site, site_text, clock, board, sessions, planner: None };
         plane.start_planner();
         Ok(plane)
     }
@@ -96,18 +97,37 @@ impl ControlPlane {
             bugs: Default::default(),
         };
         let (face, reconciler) = FleetService::new(parts);
-        let ends = CancellationToken::new();
-        let running = reconciler.run(ends.clone());
-        let task = tokio::spawn(async move { drop(running.await) });
-        self.planner = Some(Planner { ends, task, _face: face });
+        let task = BackgroundTask::spawn("the planner", |ends| async move { Ok(reconciler.run(ends).await?) });
+        self.planner = Some(Planner { task, _face: face });
+    }
+
+    /// Whether nobody plans.
+    pub fn is_planner_away(&self) -> bool {
+        self.planner.is_none()
     }
 
     /// Ends fleet's reconciler, as when its process is stopped.
-    pub async fn stop_planner(&mut self) {
-        if let Some(planner) = self.planner.take() {
-            planner.ends.cancel();
-            // It never panics in a run that goes on: what it found is in the store.
-            let _ = planner.task.await;
+    ///
+    /// # Errors
+    /// It had failed before.
+    pub async fn stop_planner(&mut self) -> anyhow::Result<()> {
+        match self.planner.take() {
+            Some(planner) => planner.task.stop().await,
+            None => Ok(()),
+        }
+    }
+
+    /// Resolves with why, if a service fails: the shift is over then.
+    pub async fn await_failure(&mut self) -> anyhow::Error {
+        let planner = async {
+            match &mut self.planner {
+                Some(planner) => planner.task.await_failure().await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            failed = planner => failed,
+            failed = self.sessions.await_failure() => failed,
         }
     }
 }

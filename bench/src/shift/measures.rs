@@ -1,6 +1,6 @@
 //! What is told of a shift: rates, times and shares, from the records of its tasks and its bodies.
 
-use super::run::Outcome;
+use super::run::{Outcome, Sample};
 use super::task_records::{TaskRecord, Urgency};
 use crate::figure::{Figure, percentile};
 use midshift_core::site::grid;
@@ -63,13 +63,18 @@ pub fn measures(outcome: &Outcome) -> Measures {
         ("steps done twice", "1", bodies.verdict.steps_done_twice as f64),
         ("items lost", "1", f64::from(u8::from(!bodies.verdict.items_conserved()))),
         ("exclusion violations", "1", bodies.verdict.exclusion_violations as f64),
-        ("no progress", "robot-min", outcome.no_progress.as_secs_f64() / 60.0),
+        ("no progress", "robot-min", outcome.no_progress.planned.as_secs_f64() / 60.0),
+        ("waiting for a person", "task-min", asking_ms(outcome) as f64 / 60_000.0),
+        ("waiting for a person at the end", "tasks", outcome.counts.asking as f64),
+        ("answers of a person", "1", outcome.counts.answers as f64),
         ("items of plans lost", "1", outcome.plans.items_lost as f64),
         ("plan by the wall, p50", "ms", percentile(&outcome.plans.plan_ms, 0.5)),
         ("plan by the wall, p99", "ms", percentile(&outcome.plans.plan_ms, 0.99)),
         ("run by the wall", "s", outcome.wall.as_secs_f64()),
     ];
     if let Some(stop) = &outcome.planner_stop {
+        let unplanned = outcome.no_progress.unplanned.as_secs_f64() / 60.0;
+        measures.push(("no progress while the planner is away", "robot-min", unplanned));
         measures.push(("backlog of the stop stays", "min", backlog_stays_ms(outcome, stop) as f64 / 60_000.0));
     }
     if !urgent_waits.is_empty() {
@@ -77,6 +82,13 @@ pub fn measures(outcome: &Outcome) -> Measures {
         measures.push(("urgent wait for a robot, p95", "s", percentile(&urgent_waits, 0.95)));
     }
     measures
+}
+
+/// Time that tasks spent in NEEDS_OPERATOR, summed up.
+fn asking_ms(outcome: &Outcome) -> u64 {
+    let mut before_ms = 0;
+    let mut since = |sample: &Sample| sample.at_ms - std::mem::replace(&mut before_ms, sample.at_ms);
+    outcome.samples.iter().map(|sample| sample.counts.asking as u64 * since(sample)).sum()
 }
 
 /// How long after the planner's return more tasks are open than when it stopped; to the end of the shift if for ever.

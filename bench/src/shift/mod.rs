@@ -10,15 +10,17 @@
 //!
 //! Left out are the port, identity, stops, roll-outs, and housekeeping: a shift is shorter than what any of it keeps.
 //!
-//! Modules, from the lowest to the highest: `clock`, `task_records`, `plan_log`, `link`, `robot`, `control_plane`, `floor`,
-//! `workload`, `scenario`, `progress`, `run`, `measures`, `chart`.
+//! Modules, from the lowest to the highest: `background_task`, `clock`, `task_records`, `plan_log`, `link`, `robot`,
+//! `control_plane`, `floor`, `operator`, `workload`, `scenario`, `progress`, `run`, `measures`, `chart`.
 
+mod background_task;
 mod chart;
 mod clock;
 mod control_plane;
 mod floor;
 mod link;
 mod measures;
+mod operator;
 mod plan_log;
 mod progress;
 mod robot;
@@ -33,7 +35,7 @@ use chart::Course;
 use clap::builder::RangedU64ValueParser;
 use floor::{Floor, TaskForm};
 use plan_log::PlansNoted;
-use run::{Outcome, ShiftConfig};
+use run::{Answers, Outcome, ShiftConfig};
 use scenario::{Scenario, Workload};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -99,6 +101,9 @@ pub struct ShiftArgs {
     /// Tasks visit their two places and handle nothing there.
     #[arg(long)]
     visits: bool,
+    /// Nobody answers tasks in NEEDS_OPERATOR.
+    #[arg(long)]
+    no_operator: bool,
     /// Bodies face their way at once, and do not turn on the spot.
     #[arg(long)]
     no_turns: bool,
@@ -131,6 +136,7 @@ impl ShiftArgs {
             turn: Duration::from_millis(self.plan_ms),
             heartbeat: self.heartbeat_ms.map(Duration::from_millis),
             turns: !self.no_turns,
+            answers: if self.no_operator { Answers::None } else { Answers::Given },
             scenario,
         }
     }
@@ -152,8 +158,7 @@ pub fn run(args: &ShiftArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> 
                     let scenario = workload.scenarios(*per_hour, args.lasts()).swap_remove(nth);
                     let title = format!("{} {}", policy.name(), scenario.name);
                     let outcome = run::run(&args.config(&floor, *seed, scenario))?;
-                    let PlansNoted { hash, items, .. } = outcome.plans;
-                    say(&format!("{title}, seed {seed}: plans {hash:016x}, {items} items"));
+                    say(&describe_end(&title, *seed, &outcome));
                     outcomes.push((title, outcome));
                 }
                 let title = outcomes.first().map(|(title, _)| title.clone()).unwrap_or_default();
@@ -169,6 +174,15 @@ pub fn run(args: &ShiftArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> 
         std::fs::write(path, chart::draw(&courses))?;
     }
     Ok(figures)
+}
+
+/// What was planned, and what was left at the end.
+fn describe_end(title: &str, seed: u64, outcome: &Outcome) -> String {
+    let open = outcome.open_tasks().into_iter().map(|((phase, why), n)| format!("{n} {phase} {why}"));
+    let open: Vec<String> = open.map(|line| line.trim_end().to_owned()).collect();
+    let open = if open.is_empty() { "none".to_owned() } else { open.join(", ") };
+    let PlansNoted { hash, items, .. } = outcome.plans;
+    format!("{title}, seed {seed}: plans {hash:016x}, {items} items; open tasks: {open}")
 }
 
 /// Tasks in an hour of `fifo-nearest` with always enough of them, by seed: what loads are multiples of. None needs it: zeros.

@@ -21,17 +21,35 @@ pub struct ProgressWatch {
     /// What each robot with a task had done, and since when it has not changed.
     stands: BTreeMap<RobotId, (Done, SiteTime)>,
     looked: SiteTime,
-    no_progress_ms: u64,
+    no_progress: NoProgress,
+}
+
+/// Time that robots with a task stood beyond their minute, summed over all.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct NoProgress {
+    /// While there was a planner.
+    pub planned: Duration,
+    /// While there was none: nobody takes a robot's word that it is done, and it has no other task.
+    pub unplanned: Duration,
+}
+
+/// Whether anybody plans.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Planning {
+    /// A planner runs.
+    Goes,
+    /// The planner is away.
+    Stopped,
 }
 
 impl ProgressWatch {
     /// Nothing was seen yet.
     pub fn new(fleet: Arc<Fleet>, records: Arc<TaskRecords>) -> Self {
-        Self { fleet, records, stands: BTreeMap::new(), looked: SiteTime(0), no_progress_ms: 0 }
+        Self { fleet, records, stands: BTreeMap::new(), looked: SiteTime(0), no_progress: Default::default() }
     }
 
     /// Looks at every robot that has a task.
-    pub fn look_at_robots(&mut self, now: SiteTime) {
+    pub fn look_at_robots(&mut self, now: SiteTime, planning: Planning) {
         let since_look_ms = now.since(std::mem::replace(&mut self.looked, now)).as_ms();
         let mut stands = BTreeMap::new();
         for robot_id in self.records.busy_robots() {
@@ -41,15 +59,19 @@ impl ProgressWatch {
             let known = self.stands.get(&robot_id).filter(|(known, _)| *known == done);
             let since = known.map_or(now, |(_, since)| *since);
             if now.since(since).as_ms() > PATIENCE_MS {
-                self.no_progress_ms += since_look_ms;
+                let sum = match planning {
+                    Planning::Goes => &mut self.no_progress.planned,
+                    Planning::Stopped => &mut self.no_progress.unplanned,
+                };
+                *sum += Duration::from_millis(since_look_ms);
             }
             stands.insert(robot_id, (done, since));
         }
         self.stands = stands;
     }
 
-    /// Time that robots stood so beyond their minute, summed over all.
-    pub fn no_progress(&self) -> Duration {
-        Duration::from_millis(self.no_progress_ms)
+    /// What was seen so far.
+    pub fn no_progress(&self) -> NoProgress {
+        self.no_progress
     }
 }

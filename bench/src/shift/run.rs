@@ -2,22 +2,27 @@
 //!
 //! Invariant: one thread, one time, one seed; nothing reads the wall but what measures it.
 
+use super::background_task::panic_message;
 use super::clock::VirtualClock;
 use super::control_plane::ControlPlane;
 use super::floor::Floor;
+use super::operator::Operator;
 use super::plan_log::PlansNoted;
-use super::progress::ProgressWatch;
+use super::progress::{NoProgress, Planning, ProgressWatch};
 use super::robot::{Robot, RobotConfig};
 use super::scenario::{BodyFaults, Scenario};
 use super::task_records::{TaskCounts, TaskRecord, TaskRecords};
 use super::workload::Client;
+use anyhow::bail;
 use midshift_core::ids::TaskId;
 use midshift_core::time::Clock;
 use midshift_sim::faults::FaultRates;
 use midshift_sim::fleet::{Fleet, FleetConfig, FleetReport};
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use tokio::task::JoinSet;
 
 /// The fleet is looked at this often, and the person who looks after broken robots goes round.
 const LOOK: Duration = Duration::from_secs(5);
@@ -45,8 +50,19 @@ pub struct ShiftConfig {
     pub heartbeat: Option<Duration>,
     /// Turning on the spot takes a body time.
     pub turns: bool,
+    /// A person answers tasks in NEEDS_OPERATOR.
+    pub answers: Answers,
     /// What is asked for, and what goes wrong.
     pub scenario: Scenario,
+}
+
+/// Whether a person is at the screen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Answers {
+    /// Tasks in NEEDS_OPERATOR stay there.
+    None,
+    /// They are answered after some minutes.
+    Given,
 }
 
 /// The fleet at one moment.
@@ -72,8 +88,8 @@ pub struct Outcome {
     pub plans: PlansNoted,
     /// What the bodies did, and whether they broke a rule.
     pub bodies: FleetReport,
-    /// Robots with a task that came on with nothing, summed up.
-    pub no_progress: Duration,
+    /// Robots with a task that came on with nothing.
+    pub no_progress: NoProgress,
     /// The fleet over time.
     pub samples: Vec<Sample>,
     /// When the planner was away.
@@ -82,10 +98,22 @@ pub struct Outcome {
     pub wall: Duration,
 }
 
+impl Outcome {
+    /// Tasks that were open at the end, by where they were and why.
+    pub fn open_tasks(&self) -> BTreeMap<(&'static str, &'static str), usize> {
+        let mut open = BTreeMap::new();
+        for task in self.tasks.iter().filter(|task| !task.phase.is_terminal()) {
+            *open.entry((task.phase.as_str(), task.reason.unwrap_or_default())).or_default() += 1;
+        }
+        open
+    }
+}
+
 /// Runs one shift.
 ///
 /// # Errors
-/// A task that is refused, a fleet that the site has no room for, or a store that cannot be read.
+/// A task that is refused, a fleet that the site has no room for, a store that cannot be read, or a service or a robot
+/// that fails.
 pub fn run(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     let begun = wall();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build()?;
@@ -105,16 +133,25 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     let mut plane =
         ControlPlane::open(floor.site.clone(), floor.text.clone(), clock.clone(), records.clone(), config.turn).await?;
     let fleet = Arc::new(open_fleet(config, &clock)?);
+    let mut robots = JoinSet::new();
     for (number, body) in (0..).zip(fleet.robots()) {
         let (telemetry, heartbeat) = (plane.telemetry.clone(), config.heartbeat);
         let robot = Robot::new(body.clone(), clock.clone(), telemetry, RobotConfig { delay: config.delay, heartbeat });
-        tokio::spawn(robot.run(SWITCHED_ON * number));
+        robots.spawn(robot.run(SWITCHED_ON * number));
     }
     tokio::time::sleep(WORK_BEGINS + SWITCHED_ON * config.robots as u32).await;
     let source = floor.tasks(config.seed)?;
     let client = Client::new(plane.tasks.clone(), source, records.clone(), clock.clone(), config.seed);
     let asking = client.run(config.scenario.demand, config.robots);
     tokio::pin!(asking);
+    let operator = Operator::new(plane.tasks.clone(), fleet.clone(), records.clone(), clock.clone(), config.seed);
+    let answering = async {
+        match config.answers {
+            Answers::Given => operator.run().await,
+            Answers::None => std::future::pending().await,
+        }
+    };
+    tokio::pin!(answering);
     let mut progress = ProgressWatch::new(fleet.clone(), records.clone());
     let mut samples = Vec::new();
     let lasts_ms = config.lasts.as_millis() as u64;
@@ -122,16 +159,22 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
         tokio::select! {
             biased;
             ended = &mut asking => ended?,
+            ended = &mut answering => ended?,
+            failed = plane.await_failure() => return Err(failed),
+            Some(ended) = robots.join_next() => {
+                bail!("a robot ended: {}", ended.err().map_or_else(|| "by itself".to_owned(), panic_message));
+            }
             () = tokio::time::sleep(LOOK) => {
                 let now = clock.now().site;
                 samples.push(Sample { at_ms: clock.elapsed_ms(), counts: records.counts() });
-                progress.look_at_robots(now);
+                let is_away = plane.is_planner_away();
+                progress.look_at_robots(now, if is_away { Planning::Stopped } else { Planning::Goes });
                 if config.scenario.faults == BodyFaults::Usual {
                     fleet.person_round(now, &|task_id: &TaskId| records.is_worked_on(task_id));
                 }
                 if let Some(stop) = &config.scenario.planner_stop {
                     let is_away = stop.contains(&Duration::from_millis(clock.elapsed_ms()));
-                    if is_away { plane.stop_planner().await } else { plane.start_planner() }
+                    if is_away { plane.stop_planner().await? } else { plane.start_planner() }
                 }
             }
         }

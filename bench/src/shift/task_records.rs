@@ -31,7 +31,10 @@ pub struct TaskRecord {
     pub done_ms: Option<u64>,
     /// Robots that were named for it, one after the other.
     pub assignments: u32,
-    phase: Phase,
+    /// Where it is.
+    pub phase: Phase,
+    /// Code of why it is there; none: there is nothing to say.
+    pub reason: Option<&'static str>,
     epoch: u64,
     robot_id: Option<RobotId>,
 }
@@ -39,7 +42,12 @@ pub struct TaskRecord {
 #[derive(Default)]
 struct Records {
     tasks: BTreeMap<TaskId, TaskRecord>,
-    busy: BTreeSet<RobotId>,
+    /// The newest task of each robot that has one.
+    busy: BTreeMap<RobotId, TaskId>,
+    /// Tasks that wait for a person.
+    asking: BTreeSet<TaskId>,
+    /// Tasks that a person has answered.
+    answers: u64,
     waiting: usize,
     open: usize,
     /// Ended in another way than done.
@@ -62,6 +70,10 @@ pub struct TaskCounts {
     pub waiting: usize,
     /// Not ended.
     pub open: usize,
+    /// In NEEDS_OPERATOR.
+    pub asking: usize,
+    /// Answers that a person gave so far.
+    pub answers: u64,
     /// Ended in another way than done.
     pub failed: u64,
     /// Said to have ended although they had ended before.
@@ -83,6 +95,7 @@ impl TaskRecords {
             done_ms: None,
             assignments: 0,
             phase: Phase::Queued,
+            reason: None,
             epoch: 0,
             robot_id: None,
         };
@@ -97,20 +110,27 @@ impl TaskRecords {
         let mut records = self.lock();
         let Some(record) = records.tasks.get_mut(&state.task_id) else { return };
         let before = std::mem::replace(&mut record.phase, state.phase);
+        record.reason = state.reason.as_ref().map(|reason| reason.code.as_str());
         if state.epoch > record.epoch {
             record.epoch = state.epoch;
             record.assignments += 1;
             record.assigned_ms.get_or_insert(now_ms);
         }
-        let has_robot = !is_waiting(state.phase) && !state.phase.is_terminal();
+        let has_robot = state.phase.has_attempt();
         let robot_id = state.robot_id.clone().filter(|_| has_robot);
         let left = std::mem::replace(&mut record.robot_id, robot_id.clone());
         let ends = state.phase.is_terminal() && !before.is_terminal();
         if ends && state.phase == Phase::Succeeded {
             record.done_ms = Some(now_ms);
         }
-        records.busy.retain(|robot_id| left.as_ref() != Some(robot_id));
-        records.busy.extend(robot_id);
+        if let Some(left) = left.filter(|left| records.busy.get(left) == Some(&state.task_id)) {
+            records.busy.remove(&left);
+        }
+        records.busy.extend(robot_id.map(|robot_id| (robot_id, state.task_id.clone())));
+        match state.phase {
+            Phase::NeedsOperator => records.asking.insert(state.task_id.clone()),
+            _ => records.asking.remove(&state.task_id),
+        };
         records.ended_twice += u64::from(before.is_terminal() && state.phase != before);
         records.failed += u64::from(ends && state.phase != Phase::Succeeded);
         records.open -= usize::from(ends);
@@ -131,13 +151,24 @@ impl TaskRecords {
     /// What is counted now.
     pub fn counts(&self) -> TaskCounts {
         let records = self.lock();
-        let Records { waiting, open, failed, ended_twice, .. } = &*records;
-        TaskCounts { waiting: *waiting, open: *open, failed: *failed, ended_twice: *ended_twice }
+        let Records { waiting, open, asking, answers, failed, ended_twice, .. } = &*records;
+        let (waiting, open, failed) = (*waiting, *open, *failed);
+        TaskCounts { waiting, open, asking: asking.len(), answers: *answers, failed, ended_twice: *ended_twice }
     }
 
     /// Robots that have a task.
     pub fn busy_robots(&self) -> BTreeSet<RobotId> {
-        self.lock().busy.clone()
+        self.lock().busy.keys().cloned().collect()
+    }
+
+    /// Tasks that wait for a person.
+    pub fn tasks_that_ask(&self) -> BTreeSet<TaskId> {
+        self.lock().asking.clone()
+    }
+
+    /// A person has answered one of them.
+    pub fn note_answer(&self) {
+        self.lock().answers += 1;
     }
 
     /// Whether a task has not ended, and waits for no person.

@@ -1,7 +1,8 @@
 //! Import of grid benchmarks: maps of squares (`type octile`), start cells and task lists.
 //!
 //! Invariant: a free cell is one waypoint `c<row * width + column>` joined to its free neighbours in four directions, 1 m
-//! apart, at 1 m/s; nothing is reserved on a grid, and bodies drive through each other (`collisions_modelled` is false).
+//! apart, at 1 m/s; bodies drive through each other (`collisions_modelled` is false), and nothing is reserved on a grid
+//! but its chargers, which benchmarks do not have: a letter of ours.
 //! Called by the command line for `--map` and `--tasks`, and by the bench.
 
 use super::draft::{Draft, DraftArea, DraftLane, DraftWaypoint};
@@ -18,6 +19,9 @@ pub const SPEED_MM_S: u32 = 1_000;
 const VIOLATIONS_MAX: usize = 100;
 /// Cells in one row of a task list.
 const CELLS_PER_TASK_MAX: usize = 32;
+
+/// Cells that a robot may be on.
+const FREE: &[u8] = b".ESC";
 
 /// The waypoint of a cell.
 fn cell_name(cell: usize) -> String {
@@ -64,8 +68,8 @@ fn header(text: &str) -> Result<Header, Refusal> {
     Err(Refusal::field("file", "there is no line `map`"))
 }
 
-/// Reads a map. `.`, `E` and `S` are free, `@` and `T` blocked; `E` and `S` become stations (all free cells, if there is
-/// none). Errors: each bad line, up to 100.
+/// Reads a map. `.`, `E`, `S` and `C` are free, `@` and `T` blocked; `E` and `S` become stations (all free cells, if there
+/// is none), and `C` a charger, which no route leads over. Errors: each bad line, up to 100.
 pub fn parse_map(name: &str, text: &str) -> Result<Site, Refusal> {
     if text.len() > SITE_FILE_BYTES {
         return Err(Refusal::field("file", format!("must be at most {SITE_FILE_BYTES} bytes")));
@@ -81,8 +85,8 @@ pub fn parse_map(name: &str, text: &str) -> Result<Site, Refusal> {
         let field = format!("line {}", lines + at + 1);
         if row.len() != width {
             v.add(field, format!("has {} cells, width says {width}", row.len()));
-        } else if let Some(column) = row.iter().position(|c| !b".ES@T".contains(c)) {
-            v.add(field, format!("column {}: a cell must be one of . E S @ T", column + 1));
+        } else if let Some(column) = row.iter().position(|c| !FREE.contains(c) && !b"@T".contains(c)) {
+            v.add(field, format!("column {}: a cell must be one of . E S C @ T", column + 1));
         }
         if v.0.len() >= VIOLATIONS_MAX {
             break;
@@ -92,21 +96,24 @@ pub fn parse_map(name: &str, text: &str) -> Result<Site, Refusal> {
         return Err(Refusal::invalid(v.0));
     }
     let marked = rows.iter().any(|row| row.iter().any(|c| b"ES".contains(c)));
-    let free =
-        |row: usize, column: usize| rows.get(row).and_then(|r| r.get(column)).is_some_and(|c| b".ES".contains(c));
+    let free = |row: usize, column: usize| rows.get(row).and_then(|r| r.get(column)).is_some_and(|c| FREE.contains(c));
     let (mut waypoints, mut lanes) = (Vec::new(), Vec::new());
     for (row, cells) in rows.iter().enumerate() {
         for column in (0..width).filter(|column| free(row, *column)) {
-            let station = !marked || cells[column] != b'.';
+            let kind = match cells[column] {
+                b'C' => Kind::Charger,
+                b'.' if marked => Kind::Junction,
+                _ => Kind::Station,
+            };
             waypoints.push(DraftWaypoint {
                 field: String::new(),
                 id: cell_name(row * width + column),
                 x_mm: column as i64 * i64::from(CELL_MM),
                 y_mm: (height - 1 - row) as i64 * i64::from(CELL_MM),
                 area: None,
-                kind: if station { Kind::Station } else { Kind::Junction },
+                kind,
                 capacity: None,
-                reserved: false,
+                reserved: kind == Kind::Charger,
             });
             for (other_row, other_column) in [(row, column + 1), (row + 1, column)] {
                 if free(other_row, other_column) {
@@ -276,6 +283,19 @@ mod tests {
         assert_eq!(site.find(&WaypointId::parse("c3").expect("a name")), None, "blocked");
         assert_eq!(Router::new(site.clone()).distance_mm(at("c0"), at("c7")), Some(4000));
         assert!(!lint::refuses(&lint::lint(&site, Some(50))));
+    }
+
+    #[test]
+    fn a_charger_is_reserved_and_no_route_leads_over_it() {
+        let site = Arc::new(parse_map("m", "type octile\nheight 2\nwidth 4\nmap\nE.CS\n....\n").expect("reads"));
+        let at = |name: &str| site.find(&WaypointId::parse(name).expect("a name")).expect(name);
+        assert_eq!(site.chargers().collect::<Vec<_>>(), [at("c2")]);
+        assert_eq!((site.places().len(), site.stations().count()), (1, 2));
+        let router = Router::new(site.clone());
+        assert_eq!(
+            (router.distance_mm(at("c0"), at("c2")), router.distance_mm(at("c0"), at("c3"))),
+            (Some(2000), Some(5000))
+        );
     }
 
     #[test]

@@ -7,7 +7,7 @@ use super::{PlaceIx, Site, WaypointIx};
 use crate::limits::ROUTE_FIELDS_BYTES;
 use lru::LruCache;
 use std::cmp::Reverse;
-use std::collections::{BTreeSet, BinaryHeap};
+use std::collections::{BTreeSet, BinaryHeap, VecDeque};
 use std::num::NonZeroUsize;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -61,17 +61,16 @@ impl DistanceField {
         Some(std::iter::successors(Some(from), |at| self.next(*at)).collect())
     }
 
-    fn compute(site: &Site, goal: WaypointIx, blocked: &Blocked) -> Self {
+    fn compute(site: &Site, goal: WaypointIx, blocked: &Blocked, mut ahead: Frontier) -> Self {
         let count = site.waypoints().len();
         let mut field = Self { goal, distance_mm: vec![NEVER; count], next: vec![goal; count] };
         let mut settled = vec![false; count];
-        let mut heap = BinaryHeap::new();
         let shut = |at: WaypointIx| site.standing_at(at).is_some_and(|p| blocked.contains(p));
         if !shut(goal) {
-            heap.push(Reverse((0_u32, goal)));
+            ahead.push(0, goal);
         }
         field.distance_mm[goal.at()] = 0;
-        while let Some(Reverse((distance, at))) = heap.pop() {
+        while let Some((distance, at)) = ahead.pop() {
             if std::mem::replace(&mut settled[at.at()], true) || (at != goal && (!site.is_through(at) || shut(at))) {
                 continue;
             }
@@ -82,7 +81,7 @@ impl DistanceField {
                 if longer < known || (longer == known && longer != NEVER && !settled[from] && at < field.next[from]) {
                     field.distance_mm[from] = longer;
                     field.next[from] = at;
-                    heap.push(Reverse((longer, lane.from)));
+                    ahead.push(longer, lane.from);
                 }
             }
         }
@@ -90,10 +89,56 @@ impl DistanceField {
     }
 }
 
+/// Waypoints that a field has reached and not looked behind, the nearest first.
+#[derive(Debug)]
+enum Frontier {
+    /// Of lanes of any length.
+    Ordered(BinaryHeap<Reverse<(u32, WaypointIx)>>),
+    /// Of lanes of one length, as on a grid: what is reached later is never nearer.
+    Queued(VecDeque<(u32, WaypointIx)>),
+}
+
+impl Frontier {
+    fn new(lanes: LaneLengths) -> Self {
+        match lanes {
+            LaneLengths::Any => Self::Ordered(BinaryHeap::new()),
+            LaneLengths::Equal => Self::Queued(VecDeque::new()),
+        }
+    }
+    fn push(&mut self, distance_mm: u32, at: WaypointIx) {
+        match self {
+            Self::Ordered(heap) => heap.push(Reverse((distance_mm, at))),
+            Self::Queued(queue) => queue.push_back((distance_mm, at)),
+        }
+    }
+    fn pop(&mut self) -> Option<(u32, WaypointIx)> {
+        match self {
+            Self::Ordered(heap) => heap.pop().map(|Reverse(nearest)| nearest),
+            Self::Queued(queue) => queue.pop_front(),
+        }
+    }
+}
+
+/// Whether all lanes of a site are equally long.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum LaneLengths {
+    Any,
+    Equal,
+}
+
+impl LaneLengths {
+    fn from_site(site: &Site) -> Self {
+        let mut lengths = site.lanes().iter().map(|lane| lane.length_mm);
+        let first = lengths.next();
+        if lengths.all(|length| Some(length) == first) { Self::Equal } else { Self::Any }
+    }
+}
+
 /// Answers route questions on one site, remembering the fields of the newest goals.
 #[derive(Debug)]
 pub struct Router {
     site: Arc<Site>,
+    lanes: LaneLengths,
     fields: Mutex<LruCache<(WaypointIx, Blocked), Arc<DistanceField>>>,
 }
 
@@ -102,7 +147,8 @@ impl Router {
     pub fn new(site: Arc<Site>) -> Self {
         let field_bytes = site.waypoints().len() * size_of::<(u32, WaypointIx)>() + 64;
         let most = NonZeroUsize::new(ROUTE_FIELDS_BYTES / field_bytes).unwrap_or(NonZeroUsize::MIN);
-        Self { site, fields: Mutex::new(LruCache::new(most)) }
+        let lanes = LaneLengths::from_site(&site);
+        Self { site, lanes, fields: Mutex::new(LruCache::new(most)) }
     }
     /// The site.
     pub fn site(&self) -> &Arc<Site> {
@@ -118,7 +164,7 @@ impl Router {
         if let Some(field) = self.remembered().get(&key) {
             return field.clone();
         }
-        let field = Arc::new(DistanceField::compute(&self.site, goal, blocked));
+        let field = Arc::new(DistanceField::compute(&self.site, goal, blocked, Frontier::new(self.lanes)));
         self.remembered().put(key, field.clone());
         field
     }
@@ -260,6 +306,31 @@ mod tests {
         let leaving = router.route_around(a, at(&site, "park-a"), &Blocked::new([place("A")]));
         assert!(leaving.is_some(), "a robot may leave a blocked place");
         assert!(router.route(a, b).is_some(), "what is blocked in one question is open in the next");
+    }
+
+    #[test]
+    fn a_field_of_equal_lanes_is_the_same_as_one_of_any() {
+        let cells: Vec<(u32, u32)> =
+            (0..6).flat_map(|x| (0..6).map(move |y| (x, y))).filter(|c| *c != (2, 3)).collect();
+        let waypoint = |(x, y): &(u32, u32)| format!("{{ id = \"c{x}{y}\", at = [{}, {}] }},\n", x * 1_000, y * 1_000);
+        let lanes = |(x, y): &(u32, u32)| {
+            let beside = [(x + 1, *y), (*x, y + 1)].into_iter().filter(|cell| cells.contains(cell));
+            beside
+                .map(|(a, b)| format!("{{ path = [\"c{x}{y}\", \"c{a}{b}\"], ways = \"wide\" }},\n"))
+                .collect::<String>()
+        };
+        let head = "site_id = \"hall\"\nname = \"hall\"\nmap_id = \"hall\"\nmap_version = \"1\"\n";
+        let (waypoints, lanes): (String, String) =
+            (cells.iter().map(waypoint).collect(), cells.iter().map(lanes).collect());
+        let site = site(&format!("{head}area = [{{ id = \"a\" }}]\nwaypoint = [{waypoints}]\nlane = [{lanes}]\n"));
+        assert_eq!(LaneLengths::from_site(&site), LaneLengths::Equal);
+        for goal in (0..site.waypoints().len() as u32).map(WaypointIx) {
+            let [queued, ordered] = [LaneLengths::Equal, LaneLengths::Any].map(|lanes| {
+                let field = DistanceField::compute(&site, goal, &Blocked::default(), Frontier::new(lanes));
+                (field.distance_mm, field.next)
+            });
+            assert_eq!(queued, ordered, "to {}", site.name_of(goal));
+        }
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! What one body is like, and what it did and suffered.
 
 use crate::behaviour::Behaviour;
+use crate::energy::EnergyScale;
 use crate::faults::FaultRates;
 use midshift_core::ids::{RobotId, WaypointId};
 use rand::SeedableRng;
@@ -37,6 +38,8 @@ pub struct BodyConfig {
     pub battery_permille: Option<u16>,
     /// The battery empties by work.
     pub drains: bool,
+    /// How fast it does, and how fast a charger fills it.
+    pub energy: EnergyScale,
     /// What its software makes of it.
     pub behaviour: Behaviour,
     /// Version of its software as it says it.
@@ -56,6 +59,7 @@ impl BodyConfig {
             faults: FaultRates::default(),
             battery_permille: None,
             drains: true,
+            energy: EnergyScale::default(),
             behaviour: Behaviour::default(),
             software: "1.0.0".to_owned(),
         }

@@ -428,7 +428,9 @@ impl SimBody {
             acting: matches!((&self.phase, &self.order), (Phase::Acting { .. }, Some(Order::Act(act))) if act.works()),
             parked: self.parked,
             charging: self.charging,
-            draw_permille: self.config.behaviour.energy_permille,
+            draw_permille: self.config.behaviour.energy_permille.saturating_mul(self.config.energy.draw_permille)
+                / 1_000,
+            charge_permille: self.config.energy.charge_permille,
             climb_c_s: f64::from(self.config.behaviour.joint_temperature_climb_millidegrees_per_s) / 1000.0,
         }
     }
