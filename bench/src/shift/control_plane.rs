@@ -6,10 +6,14 @@ use super::background_task::BackgroundTask;
 use super::clock::VirtualClock;
 use super::plan_log::PlanLog;
 use super::task_records::TaskRecords;
+use anyhow::Context;
 use midshift_core::heartbeat::NewestHeartbeat;
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
 use midshift_fleet::FleetService;
+use midshift_proto::access::local;
+use midshift_proto::fleet::v1::fleet_service_server::FleetService as Face;
+use midshift_proto::fleet::v1::{AssignmentPolicy, PlannerPolicy, PutPlannerRequest};
 use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
 use midshift_task::TaskService;
 use midshift_telemetry::TelemetryService;
@@ -25,8 +29,8 @@ const LOG_ENTRIES: usize = 20_000;
 /// A planner that runs.
 struct Planner {
     task: BackgroundTask,
-    /// A planner ends once nobody can ask it any more.
-    _face: FleetService,
+    /// What people ask. A planner ends once nobody can ask it any more.
+    face: FleetService,
 }
 
 /// The services.
@@ -98,7 +102,7 @@ impl ControlPlane {
         };
         let (face, reconciler) = FleetService::new(parts);
         let task = BackgroundTask::spawn("the planner", |ends| async move { Ok(reconciler.run(ends).await?) });
-        self.planner = Some(Planner { task, _face: face });
+        self.planner = Some(Planner { task, face });
     }
 
     /// Whether nobody plans.
@@ -129,5 +133,16 @@ impl ControlPlane {
             failed = planner => failed,
             failed = self.sessions.await_failure() => failed,
         }
+    }
+
+    /// Puts how robots are chosen, as a person does.
+    ///
+    /// # Errors
+    /// It is refused, or the planner is away.
+    pub async fn put_planner(&self, policy: AssignmentPolicy) -> anyhow::Result<()> {
+        let face = &self.planner.as_ref().context("the planner is away")?.face;
+        let policy = Some(PlannerPolicy { policy: Some(policy.into()), ..PlannerPolicy::default() });
+        face.put_planner(local(PutPlannerRequest { policy, ..PutPlannerRequest::default() })).await?;
+        Ok(())
     }
 }

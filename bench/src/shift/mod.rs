@@ -34,6 +34,7 @@ use crate::figure::Figure;
 use chart::Course;
 use clap::builder::RangedU64ValueParser;
 use floor::{Floor, TaskForm};
+use midshift_proto::fleet::v1::AssignmentPolicy;
 use plan_log::PlansNoted;
 use run::{Answers, Outcome, ShiftConfig};
 use scenario::{Scenario, Workload};
@@ -46,12 +47,22 @@ use std::time::Duration;
 enum Policy {
     /// Tasks in the order of the queue, each to the nearest idle robot.
     FifoNearest,
+    /// All that wait and all robots at once, by least cost.
+    Rolling,
 }
 
 impl Policy {
     const fn name(self) -> &'static str {
         match self {
             Self::FifoNearest => "fifo-nearest",
+            Self::Rolling => "rolling",
+        }
+    }
+
+    const fn rules(self) -> AssignmentPolicy {
+        match self {
+            Self::FifoNearest => AssignmentPolicy::FifoNearest,
+            Self::Rolling => AssignmentPolicy::Rolling,
         }
     }
 }
@@ -75,7 +86,7 @@ pub struct ShiftArgs {
     #[arg(long, default_value_t = 8.0, value_parser = parse_time)]
     hours: f64,
     /// How robots are chosen.
-    #[arg(long, value_enum, value_delimiter = ',', default_value = "fifo-nearest")]
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "fifo-nearest,rolling")]
     policy: Vec<Policy>,
     /// Runs, each with the next seed from 1.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
@@ -126,7 +137,7 @@ impl ShiftArgs {
         if self.quick { QUICK.1 } else { self.seeds }
     }
 
-    fn config(&self, floor: &Arc<Floor>, seed: u64, scenario: Scenario) -> ShiftConfig {
+    fn config(&self, floor: &Arc<Floor>, seed: u64, policy: Policy, scenario: Scenario) -> ShiftConfig {
         ShiftConfig {
             floor: floor.clone(),
             robots: self.robots,
@@ -137,6 +148,7 @@ impl ShiftArgs {
             heartbeat: self.heartbeat_ms.map(Duration::from_millis),
             turns: !self.no_turns,
             answers: if self.no_operator { Answers::None } else { Answers::Given },
+            policy: policy.rules(),
             scenario,
         }
     }
@@ -157,7 +169,7 @@ pub fn run(args: &ShiftArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> 
                 for (seed, per_hour) in seeds.iter().zip(&saturated) {
                     let scenario = workload.scenarios(*per_hour, args.lasts()).swap_remove(nth);
                     let title = format!("{} {}", policy.name(), scenario.name);
-                    let outcome = run::run(&args.config(&floor, *seed, scenario))?;
+                    let outcome = run::run(&args.config(&floor, *seed, *policy, scenario))?;
                     say(&describe_end(&title, *seed, &outcome));
                     outcomes.push((title, outcome));
                 }
@@ -192,7 +204,7 @@ fn saturated_rates(args: &ShiftArgs, floor: &Arc<Floor>, seeds: &[u64]) -> anyho
     }
     let rate = |seed: &u64| {
         let scenario = Workload::W2.scenarios(0.0, args.lasts()).swap_remove(0);
-        let mut config = args.config(floor, *seed, scenario);
+        let mut config = args.config(floor, *seed, Policy::FifoNearest, scenario);
         config.lasts = config.lasts.min(SATURATED);
         Ok(measures::tasks_per_hour(&run::run(&config)?))
     };

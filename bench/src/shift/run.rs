@@ -16,6 +16,7 @@ use super::workload::Client;
 use anyhow::bail;
 use midshift_core::ids::TaskId;
 use midshift_core::time::Clock;
+use midshift_proto::fleet::v1::AssignmentPolicy;
 use midshift_sim::faults::FaultRates;
 use midshift_sim::fleet::{Fleet, FleetConfig, FleetReport};
 use std::collections::BTreeMap;
@@ -52,6 +53,8 @@ pub struct ShiftConfig {
     pub turns: bool,
     /// A person answers tasks in NEEDS_OPERATOR.
     pub answers: Answers,
+    /// How robots are chosen.
+    pub policy: AssignmentPolicy,
     /// What is asked for, and what goes wrong.
     pub scenario: Scenario,
 }
@@ -132,6 +135,7 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     let (floor, clock, records) = (&config.floor, VirtualClock::begin(), Arc::new(TaskRecords::default()));
     let mut plane =
         ControlPlane::open(floor.site.clone(), floor.text.clone(), clock.clone(), records.clone(), config.turn).await?;
+    plane.put_planner(config.policy).await?;
     let fleet = Arc::new(open_fleet(config, &clock)?);
     let mut robots = JoinSet::new();
     for (number, body) in (0..).zip(fleet.robots()) {
