@@ -1,7 +1,9 @@
 //! Which robot gets which task, and which errand a robot gets that is left.
 //!
-//! In reading order: `readiness` brings the queue up to now; `filters` says why a robot gets no work; `candidates` are the robots that pass;
-//! `assign` gives tasks, `errands` sends idle robots to charge and park. Invariant: a robot that gets nothing has a reason by code.
+//! In reading order: `readiness` brings the queue up to now. `filters` says why a robot gets no work, `estimate` when it is free.
+//! `offers` writes an assignment; `rolling` and `nearest` (with its `candidates`) each choose what to give to whom, and `assign` asks
+//! the one that the policy names. `errands` sends idle robots to charge and park. Invariant: a robot that gets nothing has a reason
+//! by code.
 
 pub mod assign;
 pub mod candidates;

@@ -121,16 +121,16 @@ impl<'a> Finder<'a> {
         }
         let mut nearest = BinaryHeap::from(nearest);
         let mut looks = 0;
-        while let Some(Reverse((_, nth))) = nearest.pop() {
+        'nearest: while let Some(Reverse((_, nth))) = nearest.pop() {
             for rank in self.spots[nth].ranks {
+                if found >= NEAREST || looks >= LOOKS_PER_ROBOT {
+                    break 'nearest;
+                }
                 looks += 1;
                 found += usize::from(self.add(robot, &rank.task_id));
-                if found >= NEAREST || looks >= LOOKS_PER_ROBOT {
-                    slice.count_looks(looks / NEAREST);
-                    return found > 0;
-                }
             }
         }
+        slice.count_looks(looks / NEAREST);
         found > 0
     }
 

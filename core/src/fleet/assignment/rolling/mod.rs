@@ -64,7 +64,13 @@ pub fn plan(
     let pairs = choose(view, scene, choices);
     let mut taken = BTreeSet::new();
     let mut meant = Vec::new();
+    let mut decided = 0;
     for (robot, task_id) in pairs {
+        // The first is decided whatever it took to find it: else a turn might do nothing, and the next one the same.
+        if decided > 0 && plan.is_cut() {
+            break;
+        }
+        decided += usize::from(robots[robot].free != Free::Soon);
         let Robot { robot_id, free, ready_ms, .. } = &robots[robot];
         let is_free_at = now.utc.plus_ms(*ready_ms);
         match free {
