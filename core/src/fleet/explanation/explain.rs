@@ -79,15 +79,14 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
         ))
     });
     let eligible = candidates.iter().any(|c| c.reason.is_none());
-    let meant = view.meant.get(task_id).filter(|meant| view.held_by(&meant.robot_id).is_some());
-    let awaited = match (&intake.spec.robot_id, meant) {
-        (None, Some(meant)) => format!("robot {}: it is free soon and nearer than others", meant.robot_id),
-        (Some(pinned), _) => candidates.iter().find(|c| c.robot_id == *pinned).map_or_else(|| absent(pinned), awaited),
-        (None, None) => candidates.first().map_or_else(|| "a robot: none has connected".to_owned(), awaited),
+    let awaited = match &intake.spec.robot_id {
+        Some(pinned) => candidates.iter().find(|c| c.robot_id == *pinned).map_or_else(|| absent(pinned), awaited),
+        None => candidates.first().map_or_else(|| "a robot: none has connected".to_owned(), awaited),
     };
     let closed = candidates.iter().find_map(|c| barring(c.reason.as_ref())).filter(|_| !eligible).cloned();
     let eligible_ones = candidates.iter().filter(|c| c.reason.is_none()).count();
     let is_next = position.is_some_and(|position| position <= eligible_ones);
+    let meant = wait_reasons::meant_for(view, now, task);
     let expected = meant.map(|meant| meant.free.max(now.utc)).or_else(|| is_next.then_some(now.utc));
     candidates.truncate(CANDIDATES_MAX);
     let code = if eligible { Code::WaitingInQueue } else { Code::WaitingForRobot };

@@ -10,6 +10,7 @@ use crate::fleet::assignment::filters;
 use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::facts::stops::Hold;
 use crate::fleet::projection::liveness::{self, Board};
+use crate::fleet::projection::memory::MeantFor;
 use crate::fleet::projection::queue::Wait;
 use crate::fleet::projection::rows::{Place, RobotHolder};
 use crate::fleet::projection::state::FleetProjection;
@@ -66,7 +67,11 @@ pub fn of_task(
 }
 
 fn queued(view: &FleetProjection, board: &Board, now: &Now, task: &TaskState, intake: &TaskIntake) -> Option<Reason> {
-    let why = filters::task(view, board, task, intake, now).err()?;
+    let Err(why) = filters::task(view, board, task, intake, now) else {
+        let meant = meant_for(view, now, task)?;
+        let told = format!("robot {}: it is free soon and nearer than others", meant.robot_id);
+        return Some(Reason::from(Code::WaitingForRobot).with(WAITS_FOR, told));
+    };
     let what = match Wait::of_task(task, intake, &view.ended, now.utc) {
         Wait::Time(at) => at.rfc3339(),
         Wait::Hold(token) => return Some(held(why.code, &token)),
@@ -74,6 +79,12 @@ fn queued(view: &FleetProjection, board: &Board, now: &Now, task: &TaskState, in
         Wait::Turn(_) | Wait::Mark => task.robot_id.as_ref().map(|r| format!("robot {r}")).unwrap_or_default(),
     };
     Some(why.with(WAITS_FOR, what))
+}
+
+/// The robot at work that a ready task is meant for, as long as one may be.
+pub fn meant_for<'v>(view: &'v FleetProjection, now: &Now, task: &TaskState) -> Option<&'v MeantFor> {
+    let meant = view.meant.get(&task.task_id).filter(|_| view.queue.rank(&task.task_id).is_some())?;
+    (view.held_by(&meant.robot_id).is_some() && !view.meant.is_over(&task.task_id, now.site)).then_some(meant)
 }
 
 /// How a task ended, when, on which robot, and by whom if it was a person's word.
