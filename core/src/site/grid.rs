@@ -68,8 +68,8 @@ fn header(text: &str) -> Result<Header, Refusal> {
     Err(Refusal::field("file", "there is no line `map`"))
 }
 
-/// Reads a map. `.`, `E`, `S` and `C` are free, `@` and `T` blocked; `E` and `S` become stations (all free cells, if there
-/// is none), and `C` a charger, which no route leads over. Errors: each bad line, up to 100.
+/// Reads a map. `.`, `E`, `S` and `C` are free, `@` and `T` blocked; `E` and `S` become stations (all free cells, if
+/// there is none), and `C` a charger, which no route leads over. Errors: each bad line, up to 100.
 pub fn parse_map(name: &str, text: &str) -> Result<Site, Refusal> {
     if text.len() > SITE_FILE_BYTES {
         return Err(Refusal::field("file", format!("must be at most {SITE_FILE_BYTES} bytes")));
