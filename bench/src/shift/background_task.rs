@@ -72,7 +72,10 @@ mod tests {
         assert_eq!(format!("{told:#}"), "the planner failed: its map is outdated");
         let mut task = BackgroundTask::spawn("the planner", |_| async { Ok(()) });
         assert_eq!(task.await_failure().await.to_string(), "the planner ended by itself");
-        let waits = |ends: CancellationToken| async move { Ok(ends.cancelled().await) };
+        let waits = |ends: CancellationToken| async move {
+            ends.cancelled().await;
+            Ok(())
+        };
         assert!(BackgroundTask::spawn("the planner", waits).stop().await.is_ok(), "as it was told to");
     }
 }
