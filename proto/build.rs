@@ -4,7 +4,7 @@ use prost_reflect::{DescriptorPool, FieldDescriptor, MessageDescriptor, MethodDe
 use std::fmt::Write;
 use std::path::PathBuf;
 
-const FILES: [&str; 22] = [
+const FILES: [&str; 23] = [
     "midshift/common/v1/access.proto",
     "midshift/common/v1/common.proto",
     "midshift/common/v1/privacy.proto",
@@ -12,6 +12,7 @@ const FILES: [&str; 22] = [
     "midshift/task/v1/task_service.proto",
     "midshift/fleet/v1/fleet.proto",
     "midshift/fleet/v1/fleet_service.proto",
+    "midshift/fleet/v1/planner.proto",
     "midshift/identity/v1/audit_service.proto",
     "midshift/identity/v1/enrolment_service.proto",
     "midshift/identity/v1/identity_service.proto",

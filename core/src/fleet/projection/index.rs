@@ -175,7 +175,7 @@ pub(in crate::fleet) fn put_in_queue(view: &mut FleetProjection, task_id: &TaskI
     });
     view.queue.set_wait(task_id, wait);
     let rows = view.tasks.get(task_id.as_str()).map(|t| &t.row).zip(view.intakes.get(task_id.as_str()).map(|i| &i.row));
-    view.ready.put(task_id, view.queue.rank(task_id), rows, |goal| view.site.find(goal));
+    view.ready.put_task(task_id, view.queue.rank(task_id), rows, |goal| view.site.find(goal));
 }
 
 /// A task has ended: those that depend on it, if there are any, wait for the next thing, or for nothing more.

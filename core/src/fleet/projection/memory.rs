@@ -74,7 +74,7 @@ impl Meant {
         self.get(task_id).is_some_and(|meant| now.since(meant.since) > Self::FOR)
     }
     /// What a plan means: tasks with their robots, and when those are free.
-    pub(in crate::fleet) fn put(&mut self, tasks: Vec<(TaskId, RobotId, Utc)>, now: SiteTime) {
+    pub(in crate::fleet) fn put_plan(&mut self, tasks: Vec<(TaskId, RobotId, Utc)>, now: SiteTime) {
         let before = std::mem::take(&mut self.0);
         let meant = |(task_id, robot_id, free): (TaskId, RobotId, Utc)| {
             let since = before.get(&task_id).map_or(now, |meant| meant.since);

@@ -72,7 +72,7 @@ impl ReadyTasks {
     }
 
     /// Puts a task where it is found; with no rank it is not ready.
-    pub(super) fn put(
+    pub(super) fn put_task(
         &mut self,
         task_id: &TaskId,
         rank: Option<&Rank>,

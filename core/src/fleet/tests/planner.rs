@@ -8,7 +8,7 @@ use crate::ids::SiteId;
 use crate::planner_policy::{AssignmentPolicy, PlannerPolicy};
 use crate::reason::{Code, Kind, Refusal};
 
-fn put(rig: &mut Rig, policy: PlannerPolicy, seen: Option<Revision>) -> Result<Plan, Refusal> {
+fn put_policy(rig: &mut Rig, policy: PlannerPolicy, seen: Option<Revision>) -> Result<Plan, Refusal> {
     let command = Command::PutPlanner(policy);
     let Rig { view, board, now, .. } = rig;
     commands::check(view, board, now, &command, seen)?;
@@ -23,7 +23,7 @@ fn the_planner_has_its_default_until_a_person_puts_rules_and_those_from_then_on(
     let default = PlannerPolicy::default_of(rig.view.site.site_id().clone());
     assert_eq!(rig.view.planner(), default);
     let new = PlannerPolicy { policy: AssignmentPolicy::FifoNearest, horizon_ms: 0, ..default };
-    let plan = put(&mut rig, new.clone(), Some(Revision(0))).expect("nobody ever put any");
+    let plan = put_policy(&mut rig, new.clone(), Some(Revision(0))).expect("nobody ever put any");
     assert_eq!(rig.view.planner(), new);
     let [item] = plan.items.as_slice() else { panic!("{:?}", plan.items) };
     assert_eq!((item.rows[0].kind, item.rows[0].key.clone()), ("planner.policy_put", new.key()));
@@ -36,12 +36,12 @@ fn the_planner_has_its_default_until_a_person_puts_rules_and_those_from_then_on(
 fn rules_of_the_planner_that_moved_meanwhile_or_are_of_another_site_are_refused() {
     let mut rig = Rig::new();
     let default = PlannerPolicy::default_of(rig.view.site.site_id().clone());
-    put(&mut rig, default.clone(), None).expect("whatever it is");
-    let moved = put(&mut rig, default.clone(), Some(Revision(0))).expect_err("somebody was faster");
+    put_policy(&mut rig, default.clone(), None).expect("whatever it is");
+    let moved = put_policy(&mut rig, default.clone(), Some(Revision(0))).expect_err("somebody was faster");
     assert_eq!((moved.kind(), moved.reason.code), (Kind::Conflict, Code::EtagMismatch));
-    put(&mut rig, default.clone(), Some(Revision(1))).expect("as it was seen");
+    put_policy(&mut rig, default.clone(), Some(Revision(1))).expect("as it was seen");
     let elsewhere = SiteId::parse("elsewhere").expect("an id");
-    let bad = put(&mut rig, PlannerPolicy { site_id: elsewhere, horizon_ms: 60_001, ..default.clone() }, None);
+    let bad = put_policy(&mut rig, PlannerPolicy { site_id: elsewhere, horizon_ms: 60_001, ..default.clone() }, None);
     let fields: Vec<_> = bad.expect_err("not here").violations.into_iter().map(|v| v.field).collect();
     assert_eq!(fields, ["policy.site_id", "policy.horizon"]);
     assert_eq!(rig.view.planner(), default);

@@ -5,7 +5,7 @@
 //! few that are chosen.
 
 use super::cost::{self, Urgency};
-use super::robots::{Free, Robot};
+use super::robots::{Free, ROBOTS_MAX, Robot};
 use crate::fleet::assignment::filters;
 use crate::fleet::decision::slice::Slice;
 use crate::fleet::projection::liveness::Board;
@@ -149,7 +149,7 @@ impl<'a> Finder<'a> {
                 near.push(Reverse((way_mm + robot.ready_ms, nth)));
             }
         }
-        let most = if self.scene.robots.len() > super::ROBOTS_MAX { NEAREST } else { ROBOTS_OF_FIRST };
+        let most = if self.scene.robots.len() > ROBOTS_MAX { NEAREST } else { ROBOTS_OF_FIRST };
         let (mut near, mut found, mut looks) = (BinaryHeap::from(near), 0, 0);
         while let Some(Reverse((_, robot))) = near.pop().filter(|_| found < most && looks < 4 * most) {
             looks += 1;

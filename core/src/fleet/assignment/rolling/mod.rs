@@ -24,11 +24,9 @@ use crate::limits;
 use crate::planner_policy::PlannerPolicy;
 use crate::time::Now;
 use choices::{Choices, Finder, Scene};
-use robots::{Free, Robot};
+use robots::{Free, ROBOTS_MAX, Robot};
 use std::collections::BTreeSet;
 
-/// Robots that are weighed against all tasks at once. Of more of them each task looks for the nearest.
-pub const ROBOTS_MAX: usize = 256;
 /// Of so many robots each is weighed for the first tasks in the queue, half as many again.
 const FIRST_PER_TWO_ROBOTS: usize = 3;
 
@@ -88,7 +86,7 @@ pub fn plan(
             Free::Soon => meant.push((task_id, robot_id.clone(), is_free_at)),
         }
     }
-    view.meant.put(meant, now.site);
+    view.meant.put_plan(meant, now.site);
     // Those that are left may be near to tasks that were not weighed for them.
     plan.report.more |= !taken.is_empty() && taken.len() < present.len();
     let left = robots.into_iter().filter(|robot| robot.free == Free::Now && !taken.contains(&robot.robot_id));

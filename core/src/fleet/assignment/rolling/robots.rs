@@ -14,6 +14,8 @@ use crate::task::AttemptPhase;
 use crate::task::state::Errand;
 use crate::time::Now;
 
+/// Robots that are weighed against all tasks at once. Of more of them each task looks for the nearest.
+pub const ROBOTS_MAX: usize = 256;
 /// Breaking off an errand takes about so long, milliseconds: the word there, braking, and the word back.
 pub const RECALL_MS: u64 = 3_000;
 /// A thousandth of charge that a robot does not get now counts as so many milliseconds on the way: from the least charge with
@@ -36,7 +38,7 @@ pub enum Free {
 /// A robot that a plan looks at.
 #[derive(Clone, Debug)]
 pub struct Robot {
-    /// Which one.
+    /// Its id.
     pub robot_id: RobotId,
     /// Where it is free.
     pub at: WaypointIx,
