@@ -102,7 +102,8 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     }
 }
 
-fn milliseconds(time: Duration) -> prost_types::Duration {
+/// A time as the wire has it.
+pub(crate) fn milliseconds(time: Duration) -> prost_types::Duration {
     midshift_proto::convert::duration(u64::try_from(time.as_millis()).unwrap_or(u64::MAX))
 }
 

@@ -23,6 +23,7 @@ mod lookup;
 mod map;
 pub mod out;
 pub mod pages;
+mod planner;
 mod presence;
 mod push;
 mod quarantine;
@@ -75,6 +76,9 @@ pub enum Command {
     /// Live rules of areas.
     #[command(subcommand)]
     Area(area::Verb),
+    /// Live rules of the planner: how robots are chosen for tasks.
+    #[command(subcommand)]
+    Planner(planner::Verb),
     /// Site files.
     #[command(subcommand)]
     Map(map::Verb),
@@ -131,6 +135,7 @@ async fn dispatch(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Zone(verb) => zone::run(verb, out).await,
         Command::Incident(verb) => incident::run(verb, out).await,
         Command::Area(verb) => area::run(verb, out).await,
+        Command::Planner(verb) => planner::run(verb, out).await,
         Command::Map(verb) => map::run(verb, out),
         Command::Bundle(verb) => bundle::run(verb, out).await,
         Command::Rollout(verb) => rollout::run(*verb, out).await,

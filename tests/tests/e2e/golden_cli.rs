@@ -419,6 +419,10 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["area", "put", "rooms", "--frozen", "false", "--window", window])?;
     let charging = ["--charge-below", "25", "--charge-callable-above", "40", "--charge-idle-below", "70"];
     t.note(&[&["area", "put", "rooms", "--charge-to", "85", "-o", "json"][..], &charging].concat())?;
+    t.note(&["planner", "get"])?;
+    t.note(&["planner", "put", "--horizon", "20s", "--ageing", "0", "-o", "json"])?;
+    t.note(&["planner", "put", "--horizon", "2m", "--urgent-weight", "0"])?;
+    t.note(&["planner", "put", "--policy", "fifo-nearest", "--dry-run", "-o", "name"])?;
 
     // Tasks, while the robot is out of dispatch.
     let submit = ["task", "submit", "--from", "A", "--to", "B", "--sku", "SKU-1", "--task-id", "TASK-1"];

@@ -235,7 +235,7 @@ mod tests {
         let listed: Vec<&str> =
             lines.filter(|line| !line.starts_with("   ")).filter_map(|line| line.split_whitespace().next()).collect();
         let servers = ["dev", "serve", "migrate", "backup", "restore", "agent", "launcher", "sim"];
-        let work = ["task", "robot", "stop", "resume", "zone", "incident", "area", "map"];
+        let work = ["task", "robot", "stop", "resume", "zone", "incident", "area", "planner", "map"];
         let software = ["bundle", "rollout", "quarantine"];
         let rights = ["audit", "login", "context", "token", "certificate", "doctor", "health", "explain-error", "help"];
         assert_eq!(listed, [&servers[..], &work, &software, &rights].concat());

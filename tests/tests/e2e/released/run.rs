@@ -90,6 +90,7 @@ pub async fn run(engine: Engine) -> anyhow::Result<Left> {
 async fn work(line: Line) -> anyhow::Result<()> {
     line.done(&["token", "create", "orders", "--role", "operator", "--valid", "1d"])?;
     line.done(&["area", "put", "hall", "--speed-limit", "1400"])?;
+    line.done(&["planner", "put", "--horizon", "20s"])?;
     line.submit("FIRST", "rbt-01")?;
     line.submit("SECOND", "rbt-02")?;
     line.done(&["robot", "cordon", "rbt-02", "--reason", "looked at", "--request-id", "cordon-1"])?;

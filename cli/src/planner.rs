@@ -1,0 +1,180 @@
+//! `midshift planner …`: live rules of the site's planner.
+
+use super::client::{Call, Change, Exit, unary};
+use super::out::Out;
+use clap::{Subcommand, ValueEnum};
+use midshift_proto::convert::ms_of;
+use midshift_proto::fleet::v1;
+use std::time::Duration;
+
+/// Verbs of the planner.
+#[derive(Subcommand)]
+pub enum Verb {
+    /// Show the rules by which robots are chosen for tasks.
+    Get {
+        #[command(flatten)]
+        call: Call,
+    },
+    /// Change rules of the planner; what is not named stays. They hold from its next turn on.
+    Put {
+        #[command(flatten)]
+        call: Call,
+        #[command(flatten)]
+        rules: Rules,
+        #[command(flatten)]
+        change: Change,
+    },
+}
+
+/// How robots are chosen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Policy {
+    /// All tasks that may be given at once, by least cost, with an eye to robots that are free soon.
+    Rolling,
+    /// Tasks in the order of the queue, each to the nearest robot that is free. Reads no other rule.
+    FifoNearest,
+}
+
+/// What is to change; what is not named stays.
+#[derive(clap::Args, Default)]
+pub struct Rules {
+    /// How robots are chosen.
+    #[arg(long)]
+    policy: Option<Policy>,
+    /// A robot that is free within this time is taken into account already, at most 60s; 0s: none is.
+    #[arg(long, value_parser = super::duration)]
+    horizon: Option<Duration>,
+    /// What a second on the way to an urgent task weighs, 1 to 100.
+    #[arg(long, value_name = "WEIGHT")]
+    urgent_weight: Option<u32>,
+    /// The same of a normal task.
+    #[arg(long, value_name = "WEIGHT")]
+    normal_weight: Option<u32>,
+    /// The same of a background task.
+    #[arg(long, value_name = "WEIGHT")]
+    background_weight: Option<u32>,
+    /// What a task gains by each second that it has waited, in thousandths of a second on the way.
+    #[arg(long, value_name = "PERMILLE")]
+    ageing: Option<u32>,
+    /// What each second past a deadline weighs, in thousandths of a second on the way.
+    #[arg(long, value_name = "PERMILLE")]
+    lateness: Option<u32>,
+    /// What must be gained, in time on the way, before a task is meant for another robot than it was; at most 60s.
+    #[arg(long, value_parser = super::duration)]
+    hysteresis: Option<Duration>,
+}
+
+impl Rules {
+    /// The rules after the change.
+    fn over(self, old: v1::PlannerPolicy) -> v1::PlannerPolicy {
+        let policy = self.policy.map(|policy| match policy {
+            Policy::Rolling => v1::AssignmentPolicy::Rolling as i32,
+            Policy::FifoNearest => v1::AssignmentPolicy::FifoNearest as i32,
+        });
+        v1::PlannerPolicy {
+            policy: policy.or(old.policy),
+            horizon: self.horizon.map(super::area::milliseconds).or(old.horizon),
+            urgent_travel_weight: self.urgent_weight.or(old.urgent_travel_weight),
+            normal_travel_weight: self.normal_weight.or(old.normal_travel_weight),
+            background_travel_weight: self.background_weight.or(old.background_travel_weight),
+            ageing_permille: self.ageing.or(old.ageing_permille),
+            lateness_permille: self.lateness.or(old.lateness_permille),
+            hysteresis: self.hysteresis.map(super::area::milliseconds).or(old.hysteresis),
+            ..old
+        }
+    }
+}
+
+/// Runs one verb.
+pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
+    match verb {
+        Verb::Get { call } => {
+            let request = unary(v1::GetPlannerRequest {});
+            let policy = call.fleet().await?.get_planner(request).await?.into_inner().policy.unwrap_or_default();
+            show(&policy, out)
+        }
+        Verb::Put { call, rules, change } => {
+            let mut client = call.fleet().await?;
+            let request = unary(v1::GetPlannerRequest {});
+            let old = client.get_planner(request).await?.into_inner().policy.unwrap_or_default();
+            let request = v1::PutPlannerRequest {
+                policy: Some(rules.over(old)),
+                request_id: change.request_id,
+                validate_only: change.dry_run,
+            };
+            let answer = client.put_planner(unary(request)).await?.into_inner();
+            show(&answer.policy.unwrap_or_default(), out)
+        }
+    }
+}
+
+fn show(policy: &v1::PlannerPolicy, out: &Out) -> Result<(), Exit> {
+    out.one(policy, &policy.site_id, || describe(policy))?;
+    Ok(())
+}
+
+/// Two lines for people. A number of a newer version is shown as it is.
+fn describe(policy: &v1::PlannerPolicy) -> String {
+    let chosen = policy.policy.unwrap_or_default();
+    let word = match v1::AssignmentPolicy::try_from(chosen) {
+        Ok(v1::AssignmentPolicy::Rolling) => "rolling".to_owned(),
+        Ok(v1::AssignmentPolicy::FifoNearest) => "fifo-nearest".to_owned(),
+        _ => chosen.to_string(),
+    };
+    let seconds = |time: &Option<prost_types::Duration>| time.as_ref().map_or(0.0, |t| ms_of(t) as f64 / 1_000.0);
+    let number = |value: Option<u32>| value.unwrap_or_default();
+    format!(
+        "{}  policy {word}  horizon {} s  hysteresis {} s\n  way: urgent {}, normal {}, background {}  ageing {} permille  lateness {} permille",
+        policy.site_id,
+        seconds(&policy.horizon),
+        seconds(&policy.hysteresis),
+        number(policy.urgent_travel_weight),
+        number(policy.normal_travel_weight),
+        number(policy.background_travel_weight),
+        number(policy.ageing_permille),
+        number(policy.lateness_permille),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use midshift_core::ids::SiteId;
+    use midshift_core::planner_policy::PlannerPolicy;
+    use midshift_core::rows::Revision;
+    use midshift_proto::convert::fleet::encode_planner;
+
+    fn old() -> v1::PlannerPolicy {
+        let site_id = SiteId::parse("hall").expect("an id");
+        encode_planner(&PlannerPolicy::default_of(site_id), Some(Revision(7)))
+    }
+
+    #[test]
+    fn what_is_not_named_stays_and_the_etag_of_what_was_seen_goes_along() {
+        assert_eq!(Rules::default().over(old()), old());
+        let all = Rules {
+            policy: Some(Policy::FifoNearest),
+            horizon: Some(Duration::from_millis(1_500)),
+            urgent_weight: Some(9),
+            normal_weight: Some(8),
+            background_weight: Some(7),
+            ageing: Some(6),
+            lateness: Some(5),
+            hysteresis: Some(Duration::ZERO),
+        };
+        let new = all.over(old());
+        assert_eq!((new.site_id.as_str(), new.etag.as_str()), ("hall", "7"));
+        let shown = "hall  policy fifo-nearest  horizon 1.5 s  hysteresis 0 s\n  \
+                     way: urgent 9, normal 8, background 7  ageing 6 permille  lateness 5 permille";
+        assert_eq!(describe(&new), shown);
+        let back = Rules { policy: Some(Policy::Rolling), ..Rules::default() }.over(new);
+        assert_eq!(describe(&back), shown.replace("fifo-nearest", "rolling"));
+    }
+
+    #[test]
+    fn a_policy_of_a_newer_version_is_shown_by_its_number_and_stays() {
+        let newer = v1::PlannerPolicy { policy: Some(99), ..old() };
+        assert!(describe(&newer).contains("policy 99 "), "{}", describe(&newer));
+        assert_eq!(Rules { ageing: Some(1), ..Rules::default() }.over(newer).policy, Some(99));
+    }
+}
