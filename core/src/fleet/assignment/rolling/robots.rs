@@ -38,7 +38,7 @@ pub enum Free {
 /// A robot that a plan looks at.
 #[derive(Clone, Debug)]
 pub struct Robot {
-    /// Its id.
+    /// The robot that it is.
     pub robot_id: RobotId,
     /// Where it is free.
     pub at: WaypointIx,
