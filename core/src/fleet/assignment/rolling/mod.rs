@@ -76,8 +76,11 @@ pub fn plan(
                 let Some((task, intake)) = view.task(&task_id).zip(view.intake(&task_id)) else { continue };
                 let (task, intake) = (task.clone(), intake.clone());
                 plan.decide(view, now, "fleet", |tx| offers::offer(tx, &task, &intake, robot_id, board));
-                plan.report.offers += 1;
-                taken.insert(robot_id.clone());
+                // What the store would refuse was given up, and must not be tried again at once.
+                if view.held_by(robot_id).is_some() {
+                    plan.report.offers += 1;
+                    taken.insert(robot_id.clone());
+                }
             }
             Free::AfterErrand => {
                 plan.decide(view, now, "fleet", |tx| errand_reports::stop_errand(tx, robot_id));
