@@ -24,6 +24,9 @@ pub fn plan(
     let policy = view.planner();
     match policy.policy {
         AssignmentPolicy::Rolling if !view.queue.is_empty() => rolling::plan(view, board, now, heard, &policy, plan),
-        AssignmentPolicy::Rolling | AssignmentPolicy::FifoNearest => nearest::plan(view, board, now, heard, plan),
+        AssignmentPolicy::Rolling | AssignmentPolicy::FifoNearest => {
+            view.meant.put_plan(Vec::new(), now.site);
+            nearest::plan(view, board, now, heard, plan)
+        }
     }
 }

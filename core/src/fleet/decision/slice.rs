@@ -38,6 +38,10 @@ impl Slice {
     pub(in crate::fleet) const fn decide(&mut self, decisions: usize) {
         self.decisions = self.decisions.saturating_sub(decisions);
     }
+    /// Decisions that are left.
+    pub(in crate::fleet) const fn decisions(&self) -> usize {
+        self.decisions
+    }
     /// Whether the rest of a stage comes in the next turn.
     pub const fn is_spent(&self) -> bool {
         self.looks == 0 || self.decisions == 0

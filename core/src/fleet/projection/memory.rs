@@ -77,7 +77,9 @@ impl Meant {
     pub(in crate::fleet) fn put_plan(&mut self, tasks: Vec<(TaskId, RobotId, Utc)>, now: SiteTime) {
         let before = std::mem::take(&mut self.0);
         let meant = |(task_id, robot_id, free): (TaskId, RobotId, Utc)| {
-            let since = before.get(&task_id).map_or(now, |meant| meant.since);
+            // Whoever is meant now was not before, if that was too long ago to hold.
+            let since = before.get(&task_id).map(|meant| meant.since).filter(|since| now.since(*since) <= Self::FOR);
+            let since = since.unwrap_or(now);
             (task_id, MeantFor { robot_id, free, since })
         };
         self.0 = tasks.into_iter().map(meant).collect();

@@ -179,6 +179,13 @@ pub struct Walk {
     after: Option<Rank>,
 }
 
+impl Walk {
+    /// Whether it leads along tasks that are new, which are shown once.
+    pub(in crate::fleet) fn is_of_news(&self) -> bool {
+        self.only.is_some()
+    }
+}
+
 impl Queue {
     /// An empty queue at a moment.
     pub fn new(now: Utc) -> Self {
@@ -252,6 +259,10 @@ impl Queue {
         let walked = |robot_id: &RobotId| walk.robots.contains(robot_id) || self.left.contains(robot_id);
         !present.iter().all(walked) || !(self.news.is_empty() || self.left.is_empty())
     }
+    /// Whether everybody `present` found nothing, was not `heard` since, and no task came.
+    pub(in crate::fleet) fn is_seen_by_all(&mut self, present: &BTreeSet<RobotId>, heard: &BTreeSet<RobotId>) -> bool {
+        self.news.is_empty() && self.paused.is_none() && self.rested(present, heard).len() == present.len()
+    }
     /// Robots of those `present` that found nothing, and were not `heard` since.
     pub(in crate::fleet) fn rested(
         &mut self,
@@ -265,9 +276,9 @@ impl Queue {
     pub(in crate::fleet) fn take_news(&mut self) -> BTreeSet<Rank> {
         std::mem::take(&mut self.news)
     }
-    /// These robots found nothing among all tasks.
+    /// These robots found nothing.
     pub(in crate::fleet) fn let_rest(&mut self, robots: BTreeSet<RobotId>) {
-        self.left.extend(robots);
+        self.left = robots;
     }
     /// The next task of a walk.
     pub(in crate::fleet) fn next(&self, walk: &mut Walk) -> Option<TaskId> {

@@ -1,7 +1,7 @@
 //! Ready tasks by what they need of a robot and by where they begin, so that a robot finds those that are near it and for it.
 //!
 //! `index` puts a task anew when its rows change; the planner `rolling` reads.
-//! Invariant: exactly the tasks that have a turn in the queue are here, each once.
+//! Invariant: exactly the tasks that have a turn in the queue and whose goals are on the map are here, each once.
 
 use super::queue::Rank;
 use crate::ids::{RobotId, TaskId};
@@ -42,7 +42,7 @@ pub struct ReadyTask {
     pub bound_to: Option<RobotId>,
     /// What it needs.
     pub need: Arc<Need>,
-    /// Where its robot goes first; none: nowhere, or to what the site does not have.
+    /// Where its robot goes first; none: nowhere.
     pub goal: Option<WaypointIx>,
 }
 
@@ -79,13 +79,14 @@ impl ReadyTasks {
         rows: Option<(&TaskState, &TaskIntake)>,
         find: impl Fn(&crate::ids::WaypointId) -> Option<WaypointIx>,
     ) {
-        let new = rank.zip(rows).map(|(rank, (task, intake))| {
+        let new = rank.zip(rows).and_then(|(rank, (task, intake))| {
             let from = crate::step::from_step(&intake.spec.steps, task.next_step);
             let need = Need::of_intake(intake);
             let need = self.by_need.get_key_value(&need).map_or_else(|| Arc::new(need), |(known, _)| known.clone());
             let bound_to = task.opened_robot_id.as_ref().or(intake.spec.robot_id.as_ref()).cloned();
-            let goal = intake.spec.next_goal(from as usize).and_then(find);
-            ReadyTask { rank: rank.clone(), bound_to, need, goal }
+            // Where the map has lost a goal of it no robot can go.
+            let goals: Option<Vec<WaypointIx>> = intake.spec.goals(from as usize).map(find).collect();
+            Some(ReadyTask { rank: rank.clone(), bound_to, need, goal: goals?.first().copied() })
         });
         if self.tasks.get(task_id) == new.as_ref() {
             return;

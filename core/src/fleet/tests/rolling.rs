@@ -1,11 +1,14 @@
 //! Which robot gets which task where all are weighed at once.
 
 use super::*;
+use crate::fleet::assignment::errands;
 use crate::fleet::explain;
 use crate::rows::Table;
 use crate::site::grid;
 use crate::task::Phase;
 use crate::task::raw::{RawStep, RawStepKind};
+use crate::task::state::Errand;
+use std::collections::BTreeSet;
 
 /// A line of cells, `c0` to `c199`, a metre each, that robots drive along at 1 m/s.
 fn line() -> Rig {
@@ -201,8 +204,105 @@ fn a_robot_that_none_of_many_tasks_is_for_rests_until_it_is_heard_or_a_task_come
             raw.robot_id = "r2".into();
         });
     }
-    assert!(rig.cycle(Pace::Sweep).report.looked > 0);
-    assert_eq!(rig.cycle(Pace::Wake).report.looked, 0);
+    let here = BTreeSet::from([RobotId::parse("r1").expect("an id")]);
+    assert!(!rig.view.queue.is_seen_by_all(&here, &BTreeSet::new()));
+    rig.cycle(Pace::Wake);
+    assert!(rig.view.queue.is_seen_by_all(&here, &BTreeSet::new()));
+    assert!(!rig.view.queue.is_seen_by_all(&here, &here), "it was heard");
+    rig.cycle(Pace::Wake);
     rig.submit("mine", visits(&[190]));
     assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("r1", "mine")]));
+}
+
+/// A corridor with a robot that has parked and may be called from there, as its row and its report say.
+fn parked(rig: &mut Rig, id: &str, waypoint: &str) {
+    rig.robot(id, waypoint);
+    let robot_id = RobotId::parse(id).expect("an id");
+    let mut plan = Plan::default();
+    let goal = rig.view.site.find(&WaypointId::parse(waypoint).expect("a name")).expect("a waypoint");
+    let (now, board) = (rig.now, rig.board.clone());
+    let begin = |tx: &mut crate::fleet::Tx| errands::begin(tx, &robot_id, Errand::Park, goal, &board);
+    assert!(plan.decide(&mut rig.view, now, "tests", begin));
+    let attempt = rig.view.held_by(&robot_id).expect("an errand").clone();
+    let mut row = rig.view.attempt(&attempt).expect("a row").clone();
+    (row.phase, row.accepted) = (AttemptPhase::Executing, Some(now.utc));
+    let revision = rig.view.attempts[attempt.to_string().as_str()].revision;
+    rig.view.attempts.insert(attempt.to_string().into(), RevisedRow { revision, row });
+    rig.says(&robot_id, &attempt, WorkState::Executing, 0, 0);
+}
+
+/// Robots whose errand a cycle breaks off.
+fn recalled(plan: &Plan) -> usize {
+    plan.items.iter().flat_map(|item| &item.rows).filter(|row| row.kind == "errand.stopping").count()
+}
+
+#[test]
+fn one_task_calls_one_robot_from_its_errand_however_long_that_takes() {
+    let mut rig = line();
+    for nth in 0..5 {
+        parked(&mut rig, &format!("r{nth}"), &format!("c{nth}"));
+    }
+    rig.submit("task", visits(&[100]));
+    let first = rig.cycle(Pace::Wake);
+    assert_eq!(
+        recalled(&first),
+        1,
+        "{:?}",
+        first.items.iter().flat_map(|i| &i.rows).map(|r| r.kind).collect::<Vec<_>>()
+    );
+    let mut more = 0;
+    for _ in 0..40 {
+        rig.pass(1_000);
+        more += recalled(&rig.cycle(Pace::Wake));
+    }
+    assert!(more <= 1, "after half a minute another one may be called: {more}");
+}
+
+#[test]
+fn eight_tasks_that_a_robot_cannot_do_hide_none_that_it_can() {
+    let mut rig = line();
+    rig.robot("r1", "c0");
+    for nth in 0..20 {
+        rig.submit(&format!("heavy-{nth:02}"), |raw| {
+            visits(&[1])(raw);
+            raw.robot_id = "r1".into();
+            raw.payload_g = 1_000_000;
+        });
+    }
+    rig.submit("light", |raw| {
+        visits(&[150])(raw);
+        raw.robot_id = "r1".into();
+    });
+    assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("r1", "light")]));
+}
+
+#[test]
+fn a_turn_of_a_small_slice_gives_as_many_tasks_as_it_may() {
+    let mut rig = line();
+    for nth in 0..200 {
+        rig.robot(&format!("r{nth:03}"), &format!("c{nth}"));
+        rig.submit(&format!("T{nth:03}"), visits(&[nth]));
+    }
+    let mut turns = 0;
+    let mut offers = 0;
+    loop {
+        let mut plan = Plan::for_slice(crate::fleet::Slice::for_decisions(32));
+        cycle(&mut rig.view, rig.now, &rig.board, Pace::Wake, &mut plan);
+        (turns, offers) = (turns + 1, offers + plan.report.offers);
+        if !plan.report.more {
+            break;
+        }
+    }
+    assert_eq!(offers, 200);
+    assert!(turns <= 10, "{turns} turns");
+}
+
+#[test]
+fn a_task_whose_goal_the_map_has_lost_is_meant_for_nobody() {
+    let mut rig = one_soon(20);
+    rig.submit("lost", visits(&[999]));
+    let task_id = TaskId::parse("lost").expect("an id");
+    rig.cycle(Pace::Wake);
+    assert!(rig.view.meant.get(&task_id).is_none() && rig.view.ready.get(&task_id).is_none());
+    assert!(rig.view.queue.rank(&task_id).is_some(), "it waits");
 }

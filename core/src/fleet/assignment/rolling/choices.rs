@@ -13,14 +13,14 @@ use crate::fleet::projection::queue::Rank;
 use crate::fleet::projection::ready::Need;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::eligibility;
+use crate::fleet::traffic::routing;
 use crate::ids::TaskId;
 use crate::planner_policy::PlannerPolicy;
 use crate::site::WaypointIx;
-use crate::site::route::DistanceField;
-use crate::task::TaskIntake;
 use crate::time::Now;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
+use std::rc::Rc;
 use std::sync::Arc;
 
 /// Nearest tasks of a robot, or nearest robots of a task, that are weighed.
@@ -69,9 +69,28 @@ pub struct Scene<'a> {
 
 /// Ready tasks of one need that begin at one goal.
 struct Spot<'a> {
-    field: Option<Arc<DistanceField>>,
+    goal: Option<WaypointIx>,
     ranks: &'a BTreeSet<Rank>,
     need: &'a Arc<Need>,
+}
+
+/// Robots that have what a need is, by the way to one goal: put in order as far as somebody asks.
+#[derive(Default)]
+struct Near {
+    ahead: BinaryHeap<Reverse<(u64, usize)>>,
+    in_order: Vec<usize>,
+    /// Tasks that asked so far: each begins with the next robot, so that not all are shown the same.
+    asked: usize,
+}
+
+impl Near {
+    fn get(&mut self, nth: usize) -> Option<usize> {
+        while self.in_order.len() <= nth {
+            let Reverse((_, robot)) = self.ahead.pop()?;
+            self.in_order.push(robot);
+        }
+        Some(self.in_order[nth])
+    }
 }
 
 /// Finds pairs.
@@ -80,14 +99,26 @@ pub struct Finder<'a> {
     scene: Scene<'a>,
     spots: Vec<Spot<'a>>,
     /// Robots that have what is needed, by need.
-    able: BTreeMap<&'a Arc<Need>, Vec<bool>>,
+    able: BTreeMap<&'a Arc<Need>, Rc<[bool]>>,
+    near: BTreeMap<(&'a Arc<Need>, Option<WaypointIx>), Near>,
     found: Choices,
 }
 
 impl<'a> Finder<'a> {
     /// Nothing found yet.
     pub fn new(view: &'a FleetProjection, scene: Scene<'a>) -> Self {
-        Self { view, scene, spots: Vec::new(), able: BTreeMap::new(), found: Choices::default() }
+        let spots = view
+            .ready
+            .by_need()
+            .flat_map(|(need, goals)| goals.iter().map(move |(goal, ranks)| Spot { goal: *goal, ranks, need }));
+        Self {
+            view,
+            scene,
+            spots: spots.collect(),
+            able: BTreeMap::new(),
+            near: BTreeMap::new(),
+            found: Choices::default(),
+        }
     }
 
     /// All pairs that were found.
@@ -95,72 +126,93 @@ impl<'a> Finder<'a> {
         self.found
     }
 
-    /// Finds the nearest tasks of a robot. False: there is none that it could do.
-    pub fn find_tasks(&mut self, robot: usize, slice: &mut Slice) -> bool {
-        let view = self.view;
-        if self.spots.is_empty() {
-            let goals = view.ready.by_need().flat_map(|(need, goals)| goals.iter().map(move |goal| (need, goal)));
-            let spot = |(need, (goal, ranks)): (&'a Arc<Need>, (&Option<WaypointIx>, &'a BTreeSet<Rank>))| Spot {
-                field: goal.map(|goal| view.router.field(goal)),
-                ranks,
-                need,
-            };
-            self.spots = goals.map(spot).collect();
+    /// Finds the nearest tasks of a robot. False: among those that were looked at there is none that it could do.
+    pub fn find_tasks(&mut self, nth: usize, slice: &mut Slice) -> bool {
+        let (view, robot) = (self.view, &self.scene.robots[nth]);
+        let (mut found, mut looks) = (0, 0);
+        for rank in view.ready.bound_to(&robot.robot_id).take(LOOKS_PER_ROBOT) {
+            looks += 1;
+            found += usize::from(self.add_pair(nth, &rank.task_id));
+            if found >= NEAREST {
+                break;
+            }
         }
-        let bound = view.ready.bound_to(&self.scene.robots[robot].robot_id).take(NEAREST);
-        let mut found = bound.filter(|rank| self.add(robot, &rank.task_id)).count();
+        // The straight line is never longer than the way, which is asked for where it may matter.
         let mut nearest = Vec::new();
-        for nth in 0..self.spots.len() {
-            let Spot { field, ranks, need } = &self.spots[nth];
-            let way_mm = way_mm(field.as_deref(), &self.scene.robots[robot]);
-            if let (Some(way_mm), Some(first), need) = (way_mm, ranks.first(), *need)
-                && self.is_able(robot, need, first)
+        let mut able: Option<(&Arc<Need>, Rc<[bool]>)> = None;
+        for at in 0..self.spots.len() {
+            let Spot { goal, ranks, need } = self.spots[at];
+            if able.as_ref().is_none_or(|(known, _)| !Arc::ptr_eq(known, need))
+                && let Some(first) = ranks.first()
             {
-                nearest.push(Reverse((way_mm, nth)));
+                able = Some((need, self.find_able(need, first)));
+            }
+            if able.as_ref().is_some_and(|(_, able)| able[nth]) {
+                nearest.push(Reverse((line_mm(view, robot.at, goal), false, at)));
             }
         }
         let mut nearest = BinaryHeap::from(nearest);
-        let mut looks = 0;
-        'nearest: while let Some(Reverse((_, nth))) = nearest.pop() {
-            for rank in self.spots[nth].ranks {
-                if found >= NEAREST || looks >= LOOKS_PER_ROBOT {
-                    break 'nearest;
-                }
+        while let Some(Reverse((_, is_way, at))) = nearest.pop().filter(|_| found < NEAREST && looks < LOOKS_PER_ROBOT)
+        {
+            let Spot { goal, ranks, .. } = self.spots[at];
+            if !is_way {
+                let way_mm = way_mm(view, robot.at, goal);
+                nearest.extend(way_mm.map(|way_mm| Reverse((way_mm, true, at))));
+                continue;
+            }
+            // Tasks of one spot are much alike: those behind some that it cannot do are left for others.
+            let mut missed = 0;
+            for rank in ranks {
                 looks += 1;
-                found += usize::from(self.add(robot, &rank.task_id));
+                let is_found = self.add_pair(nth, &rank.task_id);
+                (found, missed) = (found + usize::from(is_found), missed + usize::from(!is_found));
+                if found >= NEAREST || missed >= NEAREST {
+                    break;
+                }
             }
         }
         slice.count_looks(looks / NEAREST);
         found > 0
     }
 
-    /// Finds robots for a task. False: there is none that could do it.
+    /// Finds robots for a task. False: there is none that is free, or can be, and could do it.
     pub fn find_robots(&mut self, task_id: &TaskId, slice: &mut Slice) -> bool {
-        let view = self.view;
+        let (view, robots) = (self.view, self.scene.robots);
         let Some(task) = view.ready.get(task_id) else { return false };
-        let field = task.goal.map(|goal| view.router.field(goal));
-        let mut near: Vec<Reverse<(u64, usize)>> = Vec::new();
-        for (nth, robot) in self.scene.robots.iter().enumerate() {
-            let is_for = task.bound_to.as_ref().is_none_or(|bound| *bound == robot.robot_id);
-            if is_for
-                && self.is_able(nth, &task.need, &task.rank)
-                && let Some(way_mm) = way_mm(field.as_deref(), robot)
-            {
-                near.push(Reverse((way_mm + robot.ready_ms, nth)));
+        if let Some(bound_to) = &task.bound_to {
+            slice.count_looks(1);
+            let nth = robots.binary_search_by(|robot| robot.robot_id.cmp(bound_to));
+            return nth.is_ok_and(|nth| self.add_pair(nth, task_id) && robots[nth].free != Free::Soon);
+        }
+        let able = self.find_able(&task.need, &task.rank);
+        let mut near = self.near.remove(&(&task.need, task.goal)).unwrap_or_else(|| {
+            let field = task.goal.map(|goal| view.router.field_around(goal, routing::closed(view)));
+            let way_mm = |robot: &Robot| field.as_ref().map_or(Some(0), |field| field.distance_mm(robot.at));
+            let able = robots.iter().enumerate().filter(|(nth, _)| able[*nth]);
+            let ahead = able.filter_map(|(nth, robot)| Some(Reverse((way_mm(robot)? + robot.ready_ms, nth))));
+            Near { ahead: ahead.collect(), ..Near::default() }
+        });
+        let most = if robots.len() > ROBOTS_MAX { NEAREST } else { ROBOTS_OF_FIRST };
+        let (mut found, mut looks, mut is_free) = (0, 0, false);
+        // Behind the last robot come those that were passed over, as far as nobody was found.
+        let begin = if robots.len() > ROBOTS_MAX { near.asked } else { 0 };
+        for at in (begin..).chain(0..begin) {
+            let is_enough = found >= most || (looks >= 4 * most && found > 0);
+            let Some(robot) = near.get(at).filter(|_| !is_enough) else { break };
+            looks += 1;
+            if self.add_pair(robot, task_id) {
+                found += 1;
+                is_free |= robots[robot].free != Free::Soon;
             }
         }
-        let most = if self.scene.robots.len() > ROBOTS_MAX { NEAREST } else { ROBOTS_OF_FIRST };
-        let (mut near, mut found, mut looks) = (BinaryHeap::from(near), 0, 0);
-        while let Some(Reverse((_, robot))) = near.pop().filter(|_| found < most && looks < 4 * most) {
-            looks += 1;
-            found += usize::from(self.add(robot, task_id));
-        }
+        near.asked += 1;
+        self.near.insert((&task.need, task.goal), near);
         slice.count_looks(1 + looks / NEAREST);
-        found > 0
+        is_free
     }
 
     /// Adds a pair unless something stands against it. Of a robot that is free everything is asked.
-    pub fn add(&mut self, robot: usize, task_id: &TaskId) -> bool {
+    pub fn add_pair(&mut self, robot: usize, task_id: &TaskId) -> bool {
         let (view, Scene { board, now, policy, robots }) = (self.view, self.scene);
         let known = self.found.known.get(task_id).copied();
         if known.is_some_and(|known| self.found.seen.contains(&(robot, known))) {
@@ -168,17 +220,17 @@ impl<'a> Finder<'a> {
         }
         let Some((task, intake)) = view.task(task_id).zip(view.intake(task_id)) else { return false };
         let Some(ready) = view.ready.get(task_id) else { return false };
-        let Robot { robot_id, free, .. } = &robots[robot];
-        let is_fit = match free {
-            Free::Now => filters::pair(view, board, robot_id, task, intake, &now).is_ok(),
-            Free::Soon if view.meant.is_over(task_id, now.site) => false,
-            Free::AfterErrand | Free::Soon => {
-                let session = view.sessions.get(robot_id.as_str());
-                session.is_some_and(|s| eligibility::fits(view, &s.row, task, intake).is_ok())
-            }
-        };
-        let field = ready.goal.map(|goal| view.router.field(goal));
-        let Some(way_mm) = way_mm(field.as_deref(), &robots[robot]).filter(|_| is_fit) else { return false };
+        let Robot { robot_id, at, free, is_low, .. } = &robots[robot];
+        let is_fit = !is_low
+            && match free {
+                Free::Now | Free::AfterErrand => filters::pair(view, board, robot_id, task, intake, &now).is_ok(),
+                Free::Soon if view.meant.is_over(task_id, now.site) => false,
+                Free::Soon => {
+                    let session = view.sessions.get(robot_id.as_str());
+                    session.is_some_and(|s| eligibility::fits(view, &s.row, task, intake).is_ok())
+                }
+            };
+        let Some(way_mm) = way_mm(view, *at, ready.goal).filter(|_| is_fit) else { return false };
         if known.is_none() && filters::task(view, board, task, intake, &now).is_err() {
             return false;
         }
@@ -200,22 +252,30 @@ impl<'a> Finder<'a> {
         true
     }
 
-    /// Whether a robot has what a task needs, as it has for all tasks of the need.
-    fn is_able(&mut self, robot: usize, need: &'a Arc<Need>, of_task: &Rank) -> bool {
+    /// Which robots have what a task needs: the same for all tasks of the need.
+    fn find_able(&mut self, need: &'a Arc<Need>, of_task: &Rank) -> Rc<[bool]> {
         let (view, robots) = (self.view, self.scene.robots);
+        let is_able = |robot: &Robot, intake| {
+            let session = view.sessions.get(robot.robot_id.as_str());
+            session.is_some_and(|s| eligibility::able(view, &s.row, intake).is_ok())
+        };
         let able = self.able.entry(need).or_insert_with(|| {
             let intake = view.intake(&of_task.task_id);
-            robots.iter().map(|robot| intake.is_some_and(|intake| is_able(view, robot, intake))).collect()
+            robots.iter().map(|robot| intake.is_some_and(|intake| is_able(robot, intake))).collect()
         });
-        able[robot]
+        able.clone()
     }
 }
 
-fn is_able(view: &FleetProjection, robot: &Robot, intake: &TaskIntake) -> bool {
-    view.sessions.get(robot.robot_id.as_str()).is_some_and(|s| eligibility::able(view, &s.row, intake).is_ok())
+/// Millimetres to a goal around closed places; 0 without a goal. None: no way leads there.
+fn way_mm(view: &FleetProjection, from: WaypointIx, goal: Option<WaypointIx>) -> Option<u64> {
+    goal.map_or(Some(0), |goal| view.router.field_around(goal, routing::closed(view)).distance_mm(from))
 }
 
-/// Millimetres from where the robot is free to a goal; 0 without a goal. None: no way leads there.
-fn way_mm(field: Option<&DistanceField>, robot: &Robot) -> Option<u64> {
-    field.map_or(Some(0), |field| field.distance_mm(robot.at))
+/// Millimetres of the straight line to a goal; 0 without one.
+fn line_mm(view: &FleetProjection, from: WaypointIx, goal: Option<WaypointIx>) -> u64 {
+    let Some(goal) = goal else { return 0 };
+    let (from, goal) = (view.site.waypoint(from), view.site.waypoint(goal));
+    let (x_mm, y_mm) = ((from.x_mm - goal.x_mm) as f64, (from.y_mm - goal.y_mm) as f64);
+    x_mm.hypot(y_mm) as u64
 }

@@ -17,10 +17,10 @@ use super::candidates::Candidate;
 use super::{filters, offers};
 use crate::fleet::decision::plan::Plan;
 use crate::fleet::projection::liveness::Board;
+use crate::fleet::projection::queue::Walk;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::errand_reports;
 use crate::ids::{RobotId, TaskId};
-use crate::limits;
 use crate::planner_policy::PlannerPolicy;
 use crate::time::Now;
 use choices::{Choices, Finder, Scene};
@@ -44,7 +44,10 @@ pub fn plan(
         return Vec::new();
     }
     let present: BTreeSet<RobotId> = free.iter().map(|robot| robot.robot_id.clone()).collect();
-    let mut robots = robots::find_stopping(view, board);
+    if view.queue.is_seen_by_all(&present, heard) {
+        return free.into_iter().filter(|robot| robot.free == Free::Now).map(Candidate::from).collect();
+    }
+    let mut robots = robots::find_stopping(view, board, &now);
     let room = ROBOTS_MAX.saturating_sub(free.len() + robots.len());
     if room > 0 {
         let mut soon = robots::find_soon(view, board, &now, policy.horizon_ms);
@@ -54,46 +57,58 @@ pub fn plan(
     robots.extend(free);
     robots.sort_by(|a, b| a.robot_id.cmp(&b.robot_id));
     let scene = Scene { board, now, policy, robots: &robots };
-    let choices = if present.len() > ROBOTS_MAX {
+    let (choices, unfinished) = if robots.len() > ROBOTS_MAX {
         find_by_task(view, scene, heard, &present, plan)
     } else {
-        find_by_robot(view, scene, heard, &present, plan)
+        (find_by_robot(view, scene, heard, &present, plan), None)
     };
-    let pairs = choose(view, scene, choices);
-    let mut taken = BTreeSet::new();
-    let mut meant = Vec::new();
-    let mut decided = 0;
+    let mut pairs = pair_up(robots.len(), &choices);
+    pairs.sort_by(|(_, a), (_, b)| view.queue.rank(a).cmp(&view.queue.rank(b)));
+    plan.slice.renew();
+    let (mut given, mut recalled, mut meant) = (BTreeSet::new(), false, Vec::new());
     for (robot, task_id) in pairs {
-        // The first is decided whatever it took to find it: else a turn might do nothing, and the next one the same.
-        if decided > 0 && plan.is_cut() {
-            break;
-        }
-        decided += usize::from(robots[robot].free != Free::Soon);
         let Robot { robot_id, free, ready_ms, .. } = &robots[robot];
-        let is_free_at = now.utc.plus_ms(*ready_ms);
-        match free {
-            Free::Now => {
-                let Some((task, intake)) = view.task(&task_id).zip(view.intake(&task_id)) else { continue };
-                let (task, intake) = (task.clone(), intake.clone());
-                plan.decide(view, now, "fleet", |tx| offers::offer(tx, &task, &intake, robot_id, board));
-                // What the store would refuse was given up, and must not be tried again at once.
-                if view.held_by(robot_id).is_some() {
-                    plan.report.offers += 1;
-                    taken.insert(robot_id.clone());
-                }
-            }
-            Free::AfterErrand => {
-                plan.decide(view, now, "fleet", |tx| errand_reports::stop_errand(tx, robot_id));
-                meant.push((task_id, robot_id.clone(), is_free_at));
-            }
-            Free::Soon => meant.push((task_id, robot_id.clone(), is_free_at)),
+        // The first is decided in any case: else a turn might do nothing, and the next one the same.
+        if *free != Free::Soon && (recalled || !given.is_empty()) && plan.is_cut() {
+            continue;
         }
+        if *free == Free::Now {
+            let Some((task, intake)) = view.task(&task_id).zip(view.intake(&task_id)) else { continue };
+            let (task, intake) = (task.clone(), intake.clone());
+            plan.decide(view, now, "fleet", |tx| offers::offer(tx, &task, &intake, robot_id, board));
+            // What the store would refuse was given up, and must not be tried again at once.
+            if view.held_by(robot_id).is_some() {
+                plan.report.offers += 1;
+                given.insert(robot_id.clone());
+            }
+            continue;
+        }
+        if *free == Free::AfterErrand {
+            plan.decide(view, now, "fleet", |tx| errand_reports::stop_errand(tx, robot_id));
+            recalled |= !filters::recallable(view, board, robot_id);
+        }
+        meant.push((task_id, robot_id.clone(), now.utc.plus_ms(*ready_ms)));
     }
     view.meant.put_plan(meant, now.site);
-    // Those that are left may be near to tasks that were not weighed for them.
-    plan.report.more |= !taken.is_empty() && taken.len() < present.len();
-    let left = robots.into_iter().filter(|robot| robot.free == Free::Now && !taken.contains(&robot.robot_id));
-    left.map(|robot| Candidate { robot_id: robot.robot_id, at: robot.at, tasks: robot.tasks }).collect()
+    let is_unfinished = unfinished.is_some();
+    if let Some(walk) = unfinished
+        && ((given.is_empty() && !recalled) || walk.is_of_news())
+    {
+        // Nothing came of these tasks, or they are shown once: the next turn goes on behind them.
+        view.queue.pause(walk);
+    }
+    // Those that are left may be near to tasks that were not weighed for them. Only who must charge does not wait for that.
+    let goes_on = is_unfinished || (!given.is_empty() && given.len() < present.len());
+    plan.report.more |= goes_on;
+    let is_left =
+        |robot: &Robot| robot.free == Free::Now && !given.contains(&robot.robot_id) && (robot.is_low || !goes_on);
+    robots.into_iter().filter(is_left).map(Candidate::from).collect()
+}
+
+impl From<Robot> for Candidate {
+    fn from(robot: Robot) -> Self {
+        Self { robot_id: robot.robot_id, at: robot.at, tasks: robot.tasks }
+    }
 }
 
 /// Of each robot its nearest tasks, and of the first tasks all robots. A robot that found nothing is shown new tasks alone
@@ -109,16 +124,19 @@ fn find_by_robot(
     let news = view.queue.take_news();
     let mut nothing = BTreeSet::new();
     let mut finder = Finder::new(view, scene);
-    for (robot, Robot { robot_id, .. }) in scene.robots.iter().enumerate() {
-        if rested.contains(robot_id) && news.len() <= ROBOTS_MAX {
-            for rank in &news {
-                finder.add(robot, &rank.task_id);
-            }
-        } else if !finder.find_tasks(robot, &mut plan.slice) && present.contains(robot_id) {
-            nothing.insert(robot_id.clone());
+    for (nth, robot) in scene.robots.iter().enumerate() {
+        let is_rested = rested.contains(&robot.robot_id) && news.len() <= ROBOTS_MAX;
+        let has_found = match (robot.is_low, is_rested) {
+            (true, _) => false,
+            (false, true) => news.iter().filter(|rank| finder.add_pair(nth, &rank.task_id)).count() > 0,
+            (false, false) => finder.find_tasks(nth, &mut plan.slice),
+        };
+        if !has_found && present.contains(&robot.robot_id) {
+            nothing.insert(robot.robot_id.clone());
         }
     }
-    let first = (present.len() - rested.len()) * FIRST_PER_TWO_ROBOTS / 2;
+    let awake = present.len() - nothing.len();
+    let first = (awake * FIRST_PER_TWO_ROBOTS / 2).min(plan.slice.decisions());
     let mut found = 0;
     for task_id in view.queue.ready().take(4 * first) {
         plan.report.looked += 1;
@@ -132,63 +150,36 @@ fn find_by_robot(
     choices
 }
 
-/// Where there are more robots than can be weighed against all tasks: of each of the first tasks the nearest robots.
+/// Where there are more robots than can be weighed against all tasks: of each of the first tasks the nearest robots. Gives
+/// back the walk along the tasks if it is not over.
 fn find_by_task(
     view: &mut FleetProjection,
     scene: Scene<'_>,
     heard: &BTreeSet<RobotId>,
     present: &BTreeSet<RobotId>,
     plan: &mut Plan,
-) -> Choices {
+) -> (Choices, Option<Walk>) {
     let mut walk = view.queue.walk(present, heard);
     let mut finder = Finder::new(view, scene);
-    let (mut found, mut is_over) = (0, false);
-    while found < limits::DECISIONS_PER_STAGE && !plan.slice.is_spent() {
+    let most = plan.slice.decisions();
+    let mut found = 0;
+    while found < most && !plan.slice.is_spent() {
         let Some(task_id) = view.queue.next(&mut walk) else {
-            is_over = true;
-            break;
+            let choices = finder.into_choices();
+            if found == 0 {
+                let left = present.intersection(&walk.robots).cloned().collect();
+                plan.report.more |= view.queue.end(&walk, left, present);
+            }
+            return (choices, None);
         };
         plan.report.looked += 1;
         found += usize::from(finder.find_robots(&task_id, &mut plan.slice));
     }
-    let choices = finder.into_choices();
-    // Whoever is weighed and given nothing walks again; only behind tasks that nobody could do a walk goes on.
-    match (is_over, found) {
-        (true, 0) => plan.report.more |= view.queue.end(&walk, present.clone(), present),
-        (true, _) => {}
-        (false, 0) => {
-            plan.report.more = true;
-            view.queue.pause(walk);
-        }
-        (false, _) => plan.report.more = true,
-    }
-    choices
+    (finder.into_choices(), Some(walk))
 }
 
 /// The pairs of least cost, as indices of robots with ids of tasks.
-fn choose(view: &FleetProjection, scene: Scene<'_>, mut choices: Choices) -> Vec<(usize, TaskId)> {
-    let Scene { board, now, robots, .. } = scene;
-    let could = |robot: usize, task_id: &TaskId| {
-        let rows = view.task(task_id).zip(view.intake(task_id));
-        rows.is_some_and(|(task, intake)| {
-            filters::pair(view, board, &robots[robot].robot_id, task, intake, &now).is_ok()
-        })
-    };
-    loop {
-        let pairs = pair_up(robots.len(), &choices);
-        let is_lost = |(robot, task): &&(usize, usize)| {
-            robots[*robot].free == Free::AfterErrand && !could(*robot, &choices.tasks[*task])
-        };
-        let lost: BTreeSet<(usize, usize)> = pairs.iter().filter(is_lost).copied().collect();
-        if lost.is_empty() {
-            return pairs.into_iter().map(|(robot, task)| (robot, choices.tasks[task].clone())).collect();
-        }
-        choices.pairs.retain(|choice| !lost.contains(&(choice.robot, choice.task)));
-    }
-}
-
-/// Pairs of robot and task whose cost is least in sum, by robot.
-fn pair_up(robots: usize, choices: &Choices) -> Vec<(usize, usize)> {
+fn pair_up(robots: usize, choices: &Choices) -> Vec<(usize, TaskId)> {
     let tasks = choices.tasks.len();
     let largest = choices.pairs.iter().map(|choice| choice.cost.abs()).max().unwrap_or(0);
     let are_robots_rows = robots <= tasks;
@@ -200,8 +191,6 @@ fn pair_up(robots: usize, choices: &Choices) -> Vec<(usize, usize)> {
     }
     let pairs = least_cost::pair_up(&rows, robots.max(tasks)).into_iter().enumerate();
     let pairs = pairs.filter_map(|(row, column)| Some((row, column?)));
-    let mut pairs: Vec<_> =
-        pairs.map(|(row, column)| if are_robots_rows { (row, column) } else { (column, row) }).collect();
-    pairs.sort_unstable();
-    pairs
+    let pairs = pairs.map(|(row, column)| if are_robots_rows { (row, column) } else { (column, row) });
+    pairs.map(|(robot, task)| (robot, choices.tasks[task].clone())).collect()
 }

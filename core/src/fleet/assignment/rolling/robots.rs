@@ -48,6 +48,8 @@ pub struct Robot {
     pub ready_ms: u64,
     /// What it costs beside time to take it from what it does, milliseconds on the way: charge that it does not get.
     pub loss_ms: u64,
+    /// It must charge before it does anything.
+    pub is_low: bool,
     /// Tasks that it was given so far.
     pub tasks: u64,
 }
@@ -57,25 +59,32 @@ pub fn find_free(view: &FleetProjection, board: &Board, now: &Now) -> Vec<Robot>
     let when = |robot_id: &RobotId| match view.held_by(robot_id) {
         None => filters::robot(view, board, robot_id, now).is_ok().then_some((Free::Now, 0)),
         Some(AttemptId { subject: Subject::Task(_), .. }) => None,
-        Some(_) => filters::recallable(view, board, robot_id).then_some((Free::AfterErrand, RECALL_MS)),
+        Some(_) => {
+            let is_it =
+                filters::recallable(view, board, robot_id) && filters::in_work(view, board, robot_id, now).is_ok();
+            is_it.then_some((Free::AfterErrand, RECALL_MS))
+        }
     };
     let robot = |robot_id: &RobotId| {
         let (free, ready_ms) = when(robot_id)?;
         let live = board.get(robot_id)?;
         let at = routing::find(view, live.report.vitals.waypoint.as_ref())?;
         let loss_ms = if free == Free::AfterErrand { loss_ms(view, live, at) } else { 0 };
-        Some(Robot { loss_ms, ..robot(view, robot_id, at, free, ready_ms) })
+        let is_low = is_low(view, live, at);
+        Some(Robot { loss_ms, is_low, ..robot(view, robot_id, at, free, ready_ms) })
     };
     board.keys().filter_map(robot).collect()
 }
 
-/// Robots that break off their errand, by id: each is meant for a task already.
-pub fn find_stopping(view: &FleetProjection, board: &Board) -> Vec<Robot> {
+/// Robots that break off their errand, by id: most are meant for a task already.
+pub fn find_stopping(view: &FleetProjection, board: &Board, now: &Now) -> Vec<Robot> {
     let robot = |(robot_id, attempt): (&RobotId, &AttemptId)| {
         let is_errand = matches!(attempt.subject, Subject::Errand { .. });
-        if !is_errand || view.attempt(attempt)?.phase != AttemptPhase::Stopping {
+        let known = view.attempt(attempt).filter(|_| is_errand)?;
+        if known.phase != AttemptPhase::Stopping || known.accepted.is_none() {
             return None;
         }
+        filters::in_work(view, board, robot_id, now).ok()?;
         let at = routing::find(view, board.get(robot_id)?.report.vitals.waypoint.as_ref())?;
         Some(robot(view, robot_id, at, Free::Soon, RECALL_MS))
     };
@@ -86,6 +95,9 @@ pub fn find_stopping(view: &FleetProjection, board: &Board) -> Vec<Robot> {
 pub fn find_soon(view: &FleetProjection, board: &Board, now: &Now, horizon_ms: u64) -> Vec<Robot> {
     let robot = |(robot_id, attempt): (&RobotId, &AttemptId)| {
         let (ready_ms, at) = ends_soon(view, board, attempt, robot_id, horizon_ms)?;
+        if is_low(view, board.get(robot_id)?, at) {
+            return None;
+        }
         filters::in_work(view, board, robot_id, now).ok()?;
         Some(robot(view, robot_id, at, Free::Soon, ready_ms))
     };
@@ -94,7 +106,13 @@ pub fn find_soon(view: &FleetProjection, board: &Board, now: &Now, horizon_ms: u
 
 fn robot(view: &FleetProjection, robot_id: &RobotId, at: WaypointIx, free: Free, ready_ms: u64) -> Robot {
     let tasks = view.control.get(robot_id.as_str()).map_or(0, |c| c.row.tasks);
-    Robot { robot_id: robot_id.clone(), at, free, ready_ms, loss_ms: 0, tasks }
+    Robot { robot_id: robot_id.clone(), at, free, ready_ms, loss_ms: 0, is_low: false, tasks }
+}
+
+/// Whether a robot must charge before it does anything, on a site where it can.
+fn is_low(view: &FleetProjection, live: &NewestHeartbeat, at: WaypointIx) -> bool {
+    let least = view.policy(&view.site.area_of(at).area_id).charge_mandatory_permille;
+    live.report.vitals.battery_permille < least && view.site.chargers().next().is_some()
 }
 
 /// What a robot loses whose charging is broken off.
