@@ -99,7 +99,7 @@ enum Command {
     #[command(display_order = 21)]
     Stop(Box<stop::Stop>),
     /// Certificates of programs that are none of ours: the proxy before a site, the database behind it.
-    #[command(subcommand, display_order = 34)]
+    #[command(subcommand, display_order = 35)]
     Certificate(Box<certificate::Verb>),
 }
 
