@@ -92,7 +92,7 @@ macro_rules! roles {
 roles! {
     Viewer "viewer" [Read], "Sees robots, tasks, roll-outs and stops.";
     Dispatcher "dispatcher" [Read Dispatch], "Brings tasks in and takes them back.";
-    Operator "operator" [Read Dispatch Operate], "Takes robots out of work and gives them back, resumes, clears places, changes rules of areas.";
+    Operator "operator" [Read Dispatch Operate], "Takes robots out of work and gives them back, resumes, clears places, changes rules of areas and of the planner.";
     OtaAuthor "ota-author" [Read Author], "Brings software, plans and runs roll-outs.";
     OtaApprover "ota-approver" [Read Approve], "Approves roll-outs that somebody else wrote.";
     OtaFullPush "ota-full-push" [Read Push], "Lets an ota-author write roll-outs that reach many robots at once.";
