@@ -278,8 +278,8 @@ async fn robots_that_wait_for_a_full_station_do_not_keep_those_inside_from_leavi
     for n in 0..3 {
         let robot_id = format!("r{n}");
         w.submit_with(&format!("T{n}"), "A03", "P01", |raw| raw.robot_id = robot_id.clone()).await;
-        w.submit_with(&format!("U{n}"), "B03", "L2-out", |raw| raw.robot_id = robot_id).await;
         w.until("it loads", |s| s.has(&format!("r{n}"), "A03")).await;
+        w.submit_with(&format!("U{n}"), "B03", "L2-out", |raw| raw.robot_id = robot_id).await;
     }
     w.until("they are inside", |s| s.holders("P01").iter().filter(|h| h.1 == HolderState::Inside).count() == 3).await;
     for n in 0..3 {
