@@ -243,7 +243,7 @@ fn shift(dir: &std::path::Path, sizes: &[&str]) -> (String, std::collections::BT
 #[test]
 fn a_shift_is_the_same_run_again_and_does_each_task_once() {
     let dir = tempfile::tempdir().expect("a directory");
-    let sizes = ["--robots", "4", "--hours", "0.1", "--workload", "w2,w6"];
+    let sizes = ["--robots", "4", "--hours", "0.1", "--seeds", "1", "--workload", "w2,w6"];
     let (said, figures) = shift(dir.path(), &sizes);
     assert_eq!(said.matches(": plans ").count(), 2, "{said}");
     assert_eq!(shift(dir.path(), &sizes).0, said, "the same seed, another run");
@@ -259,8 +259,31 @@ fn a_shift_is_the_same_run_again_and_does_each_task_once() {
 fn robots_of_a_shift_keep_out_of_each_others_places() {
     let dir = tempfile::tempdir().expect("a directory");
     let site = concat!(env!("CARGO_MANIFEST_DIR"), "/../sites/demo.site.toml");
-    let (_, figures) = shift(dir.path(), &["--site", site, "--robots", "6", "--hours", "0.1"]);
+    let (_, figures) = shift(dir.path(), &["--site", site, "--robots", "6", "--hours", "0.1", "--seeds", "1"]);
     assert!(figures["fifo-nearest W2: tasks"] > 0.0, "{figures:?}");
+    assert_rules_hold(&figures);
+}
+
+#[test]
+fn batteries_of_a_shift_empty_and_fill_by_two_rules() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let (_, figures) = shift(dir.path(), &["--robots", "4", "--hours", "1", "--seeds", "1", "--workload", "w5"]);
+    for rule in ["W5", "W5 simple"] {
+        let figure = |name: &str| figures[&format!("fifo-nearest {rule}: {name}")];
+        assert!(figure("tasks") > 0.0 && figure("charging") > 0.0, "{figures:?}");
+        assert!(figure("charge lost at work") > 0.01 && figure("batteries that ran empty") == 0.0, "{figures:?}");
+    }
+    assert_rules_hold(&figures);
+}
+
+#[test]
+fn robots_that_are_lost_in_a_passage_keep_it_until_a_person_has_looked() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let (_, figures) = shift(dir.path(), &["--robots", "8", "--hours", "0.7", "--seeds", "1", "--workload", "w7"]);
+    let figure = |name: &str| figures[&format!("fifo-nearest W7: {name}")];
+    assert_eq!(figure("robots lost inside"), 2.0, "{figures:?}");
+    let held_s = figure("held by a lost robot, longest");
+    assert!((600.0..700.0).contains(&held_s) && figure("places cleared by a person") > 0.0, "{figures:?}");
     assert_rules_hold(&figures);
 }
 

@@ -4,21 +4,26 @@
 
 use super::background_task::BackgroundTask;
 use super::clock::VirtualClock;
-use super::plan_log::PlanLog;
+use super::plan_log::{PlanLog, PlannerPace};
 use super::task_records::TaskRecords;
 use anyhow::Context;
 use midshift_core::heartbeat::NewestHeartbeat;
+use midshift_core::ids::RobotId;
+use midshift_core::limits;
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
 use midshift_fleet::FleetService;
 use midshift_proto::access::local;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService as Face;
-use midshift_proto::fleet::v1::{AssignmentPolicy, PlannerPolicy, PutPlannerRequest};
+use midshift_proto::fleet::v1::{
+    AreaPolicy, AssignmentPolicy, ClearPlaceRequest, Duty, ExplainRobotRequest, GetAreaPolicyRequest,
+    ListPlacesRequest, ListRobotControlsRequest, Place, PlannerPolicy, PutAreaPolicyRequest, PutPlannerRequest,
+    UncordonRobotRequest,
+};
 use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
 use midshift_task::TaskService;
 use midshift_telemetry::TelemetryService;
 use std::sync::Arc;
-use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
 /// Bytes of STATUS that are kept: nobody reads it.
@@ -50,7 +55,7 @@ pub struct ControlPlane {
 }
 
 impl ControlPlane {
-    /// Opens a site with an empty store and starts everything. Each turn of the planner takes `turn`.
+    /// Opens a site with an empty store and starts everything.
     ///
     /// # Errors
     /// If the store cannot be read.
@@ -59,14 +64,14 @@ impl ControlPlane {
         site_text: String,
         clock: Arc<VirtualClock>,
         records: Arc<TaskRecords>,
-        turn: Duration,
+        pace: PlannerPace,
     ) -> anyhow::Result<Self> {
         let store_id = StoreId(Arc::from("shift"));
         let any_clock: Arc<dyn Clock> = clock.clone();
         let model = MemoryStore::new(site.site_id().clone(), store_id, any_clock.clone());
         let model = Arc::new(model.with_log_entries_max(LOG_ENTRIES));
         let store: Arc<dyn Store> = model.clone();
-        let plan_log = Arc::new(PlanLog::new(model, clock.clone(), records, turn));
+        let plan_log = Arc::new(PlanLog::new(model, clock.clone(), records, pace));
         let board = LiveBoard::new();
         let parts = midshift_telemetry::Parts {
             store: store.clone(),
@@ -119,6 +124,101 @@ impl ControlPlane {
             Some(planner) => planner.task.stop().await,
             None => Ok(()),
         }
+    }
+
+    /// Puts another policy for each area for which there is one, as a person does.
+    ///
+    /// # Errors
+    /// A policy that is refused, or there is no planner that could take it.
+    pub async fn change_policies(&self, change: impl Fn(AreaPolicy) -> Option<AreaPolicy>) -> anyhow::Result<()> {
+        let face = &self.planner.as_ref().context("the planner is away")?.face;
+        for area in self.site.areas() {
+            let asked = GetAreaPolicyRequest { area_id: area.area_id.to_string() };
+            let policy = face.get_area_policy(local(asked)).await?.into_inner().policy.unwrap_or_default();
+            if let Some(policy) = change(policy) {
+                let put = PutAreaPolicyRequest { policy: Some(policy), ..PutAreaPolicyRequest::default() };
+                face.put_area_policy(local(put)).await?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Places that robots hold, as an operator lists them.
+    ///
+    /// # Errors
+    /// There is no planner that could say so.
+    pub async fn list_held_places(&self) -> anyhow::Result<Vec<Place>> {
+        let face = &self.planner.as_ref().context("the planner is away")?.face;
+        let request = ListPlacesRequest { in_use: true, page_size: limits::PAGE_MAX as u32, ..Default::default() };
+        Ok(face.list_places(local(request)).await?.into_inner().places)
+    }
+
+    /// Clears a place, as the operator does who has looked.
+    ///
+    /// # Errors
+    /// It is refused.
+    pub async fn clear_place(&self, place: &Place) -> anyhow::Result<()> {
+        let face = &self.planner.as_ref().context("the planner is away")?.face;
+        let (place_id, etag) = (place.place_id.clone(), place.etag.clone());
+        let reason = "looked: the robot is not there".to_owned();
+        face.clear_place(local(ClearPlaceRequest { place_id, etag, reason, ..Default::default() })).await?;
+        Ok(())
+    }
+
+    /// Robots that their breaker took out of work.
+    ///
+    /// # Errors
+    /// There is no planner that could say so.
+    pub async fn list_broken_off(&self) -> anyhow::Result<Vec<String>> {
+        let face = &self.planner.as_ref().context("the planner is away")?.face;
+        let request = ListRobotControlsRequest { page_size: limits::PAGE_MAX as u32, ..Default::default() };
+        let controls = face.list_robot_controls(local(request)).await?.into_inner().controls;
+        let broken_off = controls.into_iter().filter(|control| control.duty() == Duty::BrokenOff);
+        Ok(broken_off.map(|control| control.robot_id).collect())
+    }
+
+    /// Lets a robot work again, as the operator does who has looked at it.
+    ///
+    /// # Errors
+    /// It is refused.
+    pub async fn reinstate_robot(&self, robot_id: String) -> anyhow::Result<()> {
+        let face = &self.planner.as_ref().context("the planner is away")?.face;
+        face.uncordon_robot(local(UncordonRobotRequest { robot_id, ..Default::default() })).await?;
+        Ok(())
+    }
+
+    /// Code of why a robot has no work, or of what it does; of one that could work, why the first waiting task is not
+    /// given to it. Empty: nothing stands against it.
+    ///
+    /// # Errors
+    /// There is no planner that could say so, or it does not know the robot.
+    pub async fn explain_robot(&self, robot_id: &RobotId) -> anyhow::Result<String> {
+        let face = &self.planner.as_ref().context("the planner is away")?.face;
+        let request = ExplainRobotRequest { robot_id: robot_id.to_string() };
+        let explained = face.explain_robot(local(request)).await?.into_inner().explanation.unwrap_or_default();
+<<<<<<< ours
+        if std::env::var("SHIFT_DEBUG").is_ok() && explained.verdict.as_ref().is_some_and(|v| v.code == "FORCED") {
+            let now = midshift_core::time::Clock::now(self.clock.as_ref());
+            for (id, live) in self.board.all() {
+                if id == *robot_id {
+                    eprintln!("now {now:?} live {live:#?}");
+                }
+            }
+            let rows = midshift_store::Store::list(
+                self.plan_log.as_ref(),
+                midshift_store::Query::all(midshift_core::rows::Table::DesiredWork),
+            )
+            .await?;
+            for row in rows {
+                if format!("{:?}", row.key).contains(robot_id.as_str()) {
+                    eprintln!("{row:?}");
+                }
+            }
+        }
+=======
+>>>>>>> theirs
+        let first = explained.candidates.into_iter().next().and_then(|candidate| candidate.reason);
+        Ok(explained.verdict.or(first).map(|reason| reason.code).unwrap_or_default())
     }
 
     /// Resolves with why, if a service fails: the shift is over then.

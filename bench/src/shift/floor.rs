@@ -2,11 +2,12 @@
 //!
 //! Maps and lists are read by their paths. Without any, a small grid is built in, and tasks are drawn between stations.
 
+use super::chargers::place_chargers;
 use anyhow::Context;
 use midshift_cli::task_list::{read_list, request};
-use midshift_core::site::file::Loaded;
+use midshift_core::site::file::{self, Loaded};
 use midshift_core::site::route::Router;
-use midshift_core::site::{Site, grid};
+use midshift_core::site::{Site, Source, WaypointIx, grid, lint};
 use midshift_proto::task::v1::step::Kind;
 use midshift_proto::task::v1::{Goto, Step, SubmitTaskRequest, TaskSpec, submit_task_request::Body};
 use midshift_sim::workload::{Workload, WorkloadConfig};
@@ -34,6 +35,24 @@ E............E
 E............E
 ";
 
+/// What floor, as it was asked for.
+#[derive(Clone, Copy, Debug)]
+pub struct FloorSource<'a> {
+    /// Site file.
+    pub site: Option<&'a Path>,
+    /// Grid map; without it and a site the small one that is built in.
+    pub map: Option<&'a Path>,
+    /// List of tasks.
+    pub tasks: Option<&'a Path>,
+    /// Robots that work there.
+    pub robots: usize,
+    /// How a pair of places becomes a task.
+    pub form: TaskForm,
+}
+
+/// Seats that are counted of a site at most.
+const SEATS_MAX: usize = 10_000;
+
 /// A floor and its text.
 pub struct Floor {
     /// The site.
@@ -58,22 +77,55 @@ impl Floor {
     ///
     /// # Errors
     /// A file that cannot be read, or its broken rules.
-    pub fn read(
-        site: Option<&Path>,
-        map: Option<&Path>,
-        tasks: Option<&Path>,
-        robots: usize,
-        form: TaskForm,
-    ) -> anyhow::Result<Self> {
-        let (site, text) = match (site, map) {
+    pub fn read(source: FloorSource) -> anyhow::Result<Self> {
+        let (site, text) = match (source.site, source.map) {
             (None, None) => (Arc::new(grid::parse_map("shift", GRID)?), GRID.to_owned()),
-            _ => {
-                let Loaded { site, text, .. } = midshift_cli::site_file::load(site, map, Some(robots as u64))?;
+            (site, map) => {
+                let robots = Some(source.robots as u64);
+                let Loaded { site, text, .. } = midshift_cli::site_file::load(site, map, robots)?;
                 (site, text)
             }
         };
-        let mut listed = tasks.map(|path| read_list(path, &site)).transpose()?.unwrap_or_default();
-        if form == TaskForm::Visits {
+        Self::open(site, text, source)
+    }
+
+    /// The built-in demo site, which has a door and an aisle for one. Nothing is listed there.
+    ///
+    /// # Errors
+    /// It has no room for a single robot.
+    pub fn demo(source: FloorSource) -> anyhow::Result<Self> {
+        let fits = |robots: usize| file::demo(Some(robots as u64)).ok();
+        let Loaded { site, text, .. } = (1..=source.robots).rev().find_map(fits).context("the demo has no room")?;
+        Self::open(site, text, FloorSource { tasks: None, ..source })
+    }
+
+    /// Robots that it has room for: any number on a grid, where nothing is reserved.
+    pub fn seats(&self) -> usize {
+        if !self.site.collisions_modelled() {
+            return usize::MAX;
+        }
+        let fits = |robots: &usize| !lint::refuses(&lint::lint(&self.site, Some(*robots as u64)));
+        (1..=self.site.starting_places(SEATS_MAX).len()).rev().find(fits).unwrap_or(0)
+    }
+
+    /// The same floor with so many chargers, if it is a grid; a site has its own.
+    ///
+    /// # Errors
+    /// The grid has no room for so many.
+    pub fn with_chargers(&self, source: FloorSource, count: usize) -> anyhow::Result<Self> {
+        if self.site.source() != Source::Grid || self.site.chargers().next().is_some() {
+            return Self::open(self.site.clone(), self.text.clone(), source);
+        }
+        let goals = self.listed.iter().flat_map(goals);
+        let needed = goals.filter_map(|name| name.strip_prefix('c')?.parse().ok()).collect();
+        let text = place_chargers(&self.text, count, &needed)?;
+        let site = grid::parse_map(self.site.site_id().as_str(), &text)?;
+        Self::open(Arc::new(site), text, source)
+    }
+
+    fn open(site: Arc<Site>, text: String, source: FloorSource) -> anyhow::Result<Self> {
+        let mut listed = source.tasks.map(|path| read_list(path, &site)).transpose()?.unwrap_or_default();
+        if source.form == TaskForm::Visits {
             listed = listed.into_iter().map(as_visits).collect();
         }
         Ok(Self { router: Router::new(site.clone()), site, text, listed })
@@ -90,10 +142,13 @@ impl Floor {
         Ok(TaskSource { floor: self.clone(), drawn, rng, left: Vec::new() })
     }
 
-    /// The way that a task asks for, from its first goal to its last, millimetres.
-    fn way_mm(&self, request: &SubmitTaskRequest) -> u64 {
-        let goals: Vec<_> = goals(request).iter().filter_map(|name| self.site.find(&name.parse().ok()?)).collect();
+    /// The way through these goals in order, millimetres.
+    pub fn way_mm(&self, goals: &[WaypointIx]) -> u64 {
         goals.windows(2).filter_map(|pair| self.router.distance_mm(pair[0], pair[1])).sum()
+    }
+
+    fn find_goals(&self, request: &SubmitTaskRequest) -> Vec<WaypointIx> {
+        goals(request).iter().filter_map(|name| self.site.find(&name.parse().ok()?)).collect()
     }
 }
 
@@ -134,8 +189,8 @@ pub struct TaskSource {
 }
 
 impl TaskSource {
-    /// The next task, and the way that it asks for in millimetres. A list begins anew when it is over.
-    pub fn next_task(&mut self) -> (SubmitTaskRequest, u64) {
+    /// The next task, and its goals in order. A list begins anew when it is over.
+    pub fn next_task(&mut self) -> (SubmitTaskRequest, Vec<WaypointIx>) {
         if self.left.is_empty() {
             self.left = (0..self.floor.listed.len()).collect();
             self.left.shuffle(&mut self.rng);
@@ -144,7 +199,7 @@ impl TaskSource {
             Some(at) => self.floor.listed[at].clone(),
             None => request(&self.drawn.next_transport()),
         };
-        let way_mm = self.floor.way_mm(&request);
-        (request, way_mm)
+        let goals = self.floor.find_goals(&request);
+        (request, goals)
     }
 }

@@ -1,9 +1,12 @@
 //! What is told of a shift: rates, times and shares, from the records of its tasks and its bodies.
 
 use super::run::{Outcome, Sample};
+use super::scenario::BATTERY_RATES;
 use super::task_records::{TaskRecord, Urgency};
 use crate::figure::{Figure, percentile};
+use midshift_core::energy::{CAPACITY_MWH, IDLE_W};
 use midshift_core::site::grid;
+use midshift_sim::faults::FAULT_BATTERY_EMPTY;
 use std::ops::Range;
 use std::time::Duration;
 
@@ -41,12 +44,9 @@ pub fn measures(outcome: &Outcome) -> Measures {
     let share = |ms: u64| 100.0 * ms as f64 / robots_ms;
     let assigned = outcome.tasks.iter().filter(|t| t.assignments > 0);
     let (assigned, assignments) = assigned.fold((0_u64, 0_u64), |(n, sum), t| (n + 1, sum + u64::from(t.assignments)));
-    // Visits carry nothing: then the ways that tasks asked for count.
-    let asked_mm = outcome.tasks.iter().filter(|t| t.done_ms.is_some()).map(|t| t.way_mm).sum();
-    let loaded_mm: u64 = if bodies.loaded_path_mm > 0 { bodies.loaded_path_mm } else { asked_mm };
     let mut measures = vec![
         ("tasks", "1/h", tasks_per_hour(outcome)),
-        ("empty travel", "%", 100.0 * (1.0 - loaded_mm as f64 / bodies.path_mm.max(1) as f64)),
+        ("empty travel", "%", 100.0 * (1.0 - outcome.loaded_mm as f64 / bodies.path_mm.max(1) as f64)),
         ("completion, p50", "s", percentile(&completion, 0.5)),
         ("completion, p95", "s", percentile(&completion, 0.95)),
         ("wait for a robot, p50", "s", percentile(&waits, 0.5)),
@@ -67,6 +67,7 @@ pub fn measures(outcome: &Outcome) -> Measures {
         ("waiting for a person", "task-min", asking_ms(outcome) as f64 / 60_000.0),
         ("waiting for a person at the end", "tasks", outcome.counts.asking as f64),
         ("answers of a person", "1", outcome.counts.answers as f64),
+        ("robots let work again by a person", "1", outcome.reinstated as f64),
         ("items of plans lost", "1", outcome.plans.items_lost as f64),
         ("plan by the wall, p50", "ms", percentile(&outcome.plans.plan_ms, 0.5)),
         ("plan by the wall, p99", "ms", percentile(&outcome.plans.plan_ms, 0.99)),
@@ -77,11 +78,40 @@ pub fn measures(outcome: &Outcome) -> Measures {
         measures.push(("no progress while the planner is away", "robot-min", unplanned));
         measures.push(("backlog of the stop stays", "min", backlog_stays_ms(outcome, stop) as f64 / 60_000.0));
     }
+    if outcome.charging.is_some() {
+        measures.extend(battery_measures(outcome));
+    }
+    if let Some(losses) = &outcome.losses {
+        measures.push(("robots lost inside", "1", losses.robots as f64));
+        measures.push(("held by a lost robot, longest", "s", losses.longest_hold_ms as f64 / 1e3));
+        measures.push(("passage held by a lost robot, longest", "s", losses.longest_passage_hold_ms as f64 / 1e3));
+        measures.push(("places cleared by a person", "1", losses.cleared as f64));
+    }
     if !urgent_waits.is_empty() {
         measures.push(("urgent wait for a robot, p50", "s", percentile(&urgent_waits, 0.5)));
         measures.push(("urgent wait for a robot, p95", "s", percentile(&urgent_waits, 0.95)));
     }
     measures
+}
+
+/// What is told of batteries.
+fn battery_measures(outcome: &Outcome) -> Measures {
+    let counts = &outcome.bodies.counts;
+    let busy_ms = counts.driving_ms + counts.acting_ms + counts.blocked_ms + counts.halted_ms;
+    let idle_w = IDLE_W * f64::from(BATTERY_RATES.draw_permille) / 1e3;
+    let busy_mwh = outcome.bodies.energy_mwh as f64 - idle_w * counts.idle_ms as f64 / 3_600.0;
+    let lost_a_second = 100.0 * busy_mwh / CAPACITY_MWH / (busy_ms as f64 / 1e3).max(1.0);
+    let at_chargers: usize = outcome.samples.iter().map(|sample| sample.batteries.charging).sum();
+    let lowest = outcome.samples.iter().map(|sample| sample.batteries.lowest_permille).min().unwrap_or_default();
+    let empty = outcome.bodies.faults_by_code.get(&FAULT_BATTERY_EMPTY).copied().unwrap_or_default();
+    let robots = (outcome.samples.len() * outcome.robots).max(1) as f64;
+    vec![
+        ("charge lost at work", "%/s", lost_a_second),
+        ("charging", "%", 100.0 * at_chargers as f64 / robots),
+        ("lowest charge", "%", f64::from(lowest) / 10.0),
+        ("batteries that ran empty", "1", empty as f64),
+        ("waiting at the end", "tasks", outcome.counts.waiting as f64),
+    ]
 }
 
 /// Time that tasks spent in NEEDS_OPERATOR, summed up.

@@ -2,7 +2,7 @@
 //!
 //! Noted are a hash of every item, how long each plan took by the wall, and what became of each task. Only fleet has
 //! this handle; the other services have the store itself. Invariant: it changes nothing, and
-//! delays nothing but the planner, by the virtual time that each of its turns is to take.
+//! delays nothing but the planner, by the virtual time that each of its turns is to take and the pause between two.
 
 use super::clock::VirtualClock;
 use super::task_records::TaskRecords;
@@ -48,16 +48,48 @@ pub struct PlanLog {
     store: Arc<MemoryStore>,
     clock: Arc<VirtualClock>,
     records: Arc<TaskRecords>,
-    /// Virtual time that each turn of the planner takes. It rests as long after it, so that news gather.
+    /// Virtual time that each turn of the planner takes.
     turn: Duration,
+    /// Says that something was written.
+    wake: watch::Receiver<Seq>,
     noted: Mutex<Noted>,
 }
 
+/// How often the planner has its turn, in virtual time. It always has one in each of its sweeps.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct PlannerPace {
+    /// Each turn takes so long, and the planner rests as long after it, so that news gather.
+    pub turn: Duration,
+    /// Between two sweeps it is told that something was written at most once in so long; zero: at once.
+    pub pause: Duration,
+}
+
+/// Passes wakes on, with a pause after each.
+fn pass_on_wakes(mut from: watch::Receiver<Seq>, pause: Duration) -> watch::Receiver<Seq> {
+    let (sender, wake) = watch::channel(*from.borrow());
+    tokio::spawn(async move {
+        while from.changed().await.is_ok() {
+            let seq = *from.borrow_and_update();
+            if sender.send(seq).is_err() {
+                return;
+            }
+            tokio::time::sleep(pause).await;
+        }
+    });
+    wake
+}
+
 impl PlanLog {
-    /// Nothing is noted yet. Each turn of the planner takes `turn` of virtual time.
-    pub fn new(store: Arc<MemoryStore>, clock: Arc<VirtualClock>, records: Arc<TaskRecords>, turn: Duration) -> Self {
+    /// Nothing is noted yet.
+    pub fn new(
+        store: Arc<MemoryStore>,
+        clock: Arc<VirtualClock>,
+        records: Arc<TaskRecords>,
+        PlannerPace { turn, pause }: PlannerPace,
+    ) -> Self {
+        let wake = if pause.is_zero() { store.wake() } else { pass_on_wakes(store.wake(), pause) };
         let plans = PlansNoted { hash: HASH_BEGIN, items: 0, items_lost: 0, plan_ms: Vec::new() };
-        Self { store, clock, records, turn, noted: Mutex::new(Noted { plans, read_at: None }) }
+        Self { store, clock, records, turn, wake, noted: Mutex::new(Noted { plans, read_at: None }) }
     }
 
     /// What was noted so far.
@@ -154,7 +186,7 @@ impl Store for PlanLog {
         self.store.feed_of(subjects, after, limit).await
     }
     fn wake(&self) -> watch::Receiver<Seq> {
-        self.store.wake()
+        self.wake.clone()
     }
     async fn raise_head(&self, at_least: Seq) -> Result<Seq, Error> {
         self.store.raise_head(at_least).await

@@ -14,6 +14,7 @@ use midshift_proto::link::v1::SessionResponse;
 use midshift_proto::session::{Hello, LanePosition, PROTOCOL_VERSION, Previous, ToRobot};
 use midshift_sim::handle::SimHandle;
 use midshift_telemetry::TelemetryService;
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 use tokio_stream::StreamExt;
@@ -124,18 +125,20 @@ impl Robot {
     }
 
     fn step(&mut self, input: Input) {
-        let mut next = Some(input);
-        while let Some(input) = next.take() {
+        let mut inputs = VecDeque::from([input]);
+        while let Some(input) = inputs.pop_front() {
             for output in self.core.step(self.clock.now(), input) {
                 match output {
-                    Output::Persist(batch, _) => next = Some(Input::Persisted(batch)),
+                    Output::Persist(batch, _) => inputs.push_back(Input::Persisted(batch)),
                     Output::Send(uplink) => {
                         if self.link.as_ref().is_some_and(|link| !link.send(*uplink)) {
                             self.link = None;
                         }
                     }
                     // There is no bulk connection: old STATUS goes on the session.
-                    Output::Replay(replay) => next = Some(Input::Replayed(replay.session_epoch, Replayed::NotServed)),
+                    Output::Replay(replay) => {
+                        inputs.push_back(Input::Replayed(replay.session_epoch, Replayed::NotServed));
+                    }
                     Output::Job(_) | Output::DropJob | Output::Exit(_) => {}
                     Output::CheckIn(..) | Output::RedialStop(_) | Output::SaveStops(..) => {}
                 }

@@ -3,20 +3,25 @@
 //! Invariant: one thread, one time, one seed; nothing reads the wall but what measures it.
 
 use super::background_task::panic_message;
+use super::breakers::BreakerWatch;
 use super::clock::VirtualClock;
 use super::control_plane::ControlPlane;
 use super::floor::Floor;
+use super::lost_robots::{LossReport, LostRobots};
 use super::operator::Operator;
-use super::plan_log::PlansNoted;
+use super::plan_log::{PlannerPace, PlansNoted};
 use super::progress::{NoProgress, Planning, ProgressWatch};
 use super::robot::{Robot, RobotConfig};
-use super::scenario::{BodyFaults, Scenario};
+use super::scenario::{BATTERY_RATES, BodyFaults, ChargingRule, Losses, Scenario};
 use super::task_records::{TaskCounts, TaskRecord, TaskRecords};
 use super::workload::Client;
 use anyhow::bail;
+use midshift_agent::body::Body as _;
 use midshift_core::ids::TaskId;
-use midshift_core::time::Clock;
+use midshift_core::site::WaypointIx;
+use midshift_core::time::{Clock, SiteTime};
 use midshift_proto::fleet::v1::AssignmentPolicy;
+use midshift_sim::energy::EnergyScale;
 use midshift_sim::faults::FaultRates;
 use midshift_sim::fleet::{Fleet, FleetConfig, FleetReport};
 use std::collections::BTreeMap;
@@ -32,6 +37,12 @@ const SWITCHED_ON: Duration = Duration::from_millis(13);
 /// Work begins once every robot has had so long.
 const WORK_BEGINS: Duration = Duration::from_secs(3);
 
+/// Obstacles in a kilometre where bodies are delayed.
+const DELAYS_PER_KM: f64 = 4.0 * 0.5;
+
+/// Robots that are asked at the end what they do, at most.
+const EXPLAINED_MAX: usize = 100;
+
 /// What one shift is.
 #[derive(Clone)]
 pub struct ShiftConfig {
@@ -45,8 +56,8 @@ pub struct ShiftConfig {
     pub seed: u64,
     /// Time that a message takes between a robot and the server, each way.
     pub delay: Duration,
-    /// Virtual time that each turn of the planner takes.
-    pub turn: Duration,
+    /// How often the planner has its turn.
+    pub pace: PlannerPace,
     /// Pause between two heartbeats; none: as the server says.
     pub heartbeat: Option<Duration>,
     /// Turning on the spot takes a body time.
@@ -75,6 +86,25 @@ pub struct Sample {
     pub at_ms: u64,
     /// Tasks at that moment.
     pub counts: TaskCounts,
+    /// Batteries at that moment.
+    pub batteries: Batteries,
+}
+
+/// The batteries of a fleet at one moment.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Batteries {
+    /// The lowest of all, permille.
+    pub lowest_permille: u16,
+    /// Robots into whose battery energy flows.
+    pub charging: usize,
+}
+
+impl Batteries {
+    fn read(fleet: &Fleet, now: SiteTime) -> Self {
+        let states: Vec<_> = fleet.robots().iter().map(|robot| robot.state(now)).collect();
+        let lowest_permille = states.iter().map(|state| state.battery_permille).min().unwrap_or_default();
+        Self { lowest_permille, charging: states.iter().filter(|state| state.charging).count() }
+    }
 }
 
 /// What came of a shift.
@@ -83,6 +113,8 @@ pub struct Outcome {
     pub robots: usize,
     /// How long it lasted, milliseconds.
     pub lasted_ms: u64,
+    /// Driven with a load; where nothing is carried, the ways that tasks asked for between their goals. Millimetres.
+    pub loaded_mm: u64,
     /// Every task.
     pub tasks: Vec<TaskRecord>,
     /// Tasks at the end.
@@ -93,6 +125,14 @@ pub struct Outcome {
     pub bodies: FleetReport,
     /// Robots with a task that came on with nothing.
     pub no_progress: NoProgress,
+    /// When robots charged; none: batteries did not empty.
+    pub charging: Option<ChargingRule>,
+    /// Of robots that were lost; none: none were to be.
+    pub losses: Option<LossReport>,
+    /// Robots at the end by the code of what they do, or of why they do nothing. Empty: too many to ask.
+    pub verdicts: BTreeMap<String, usize>,
+    /// Robots that a person let work again after their breaker had opened.
+    pub reinstated: u64,
     /// The fleet over time.
     pub samples: Vec<Sample>,
     /// When the planner was away.
@@ -134,7 +174,7 @@ fn wall() -> Instant {
 async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     let (floor, clock, records) = (&config.floor, VirtualClock::begin(), Arc::new(TaskRecords::default()));
     let mut plane =
-        ControlPlane::open(floor.site.clone(), floor.text.clone(), clock.clone(), records.clone(), config.turn).await?;
+        ControlPlane::open(floor.site.clone(), floor.text.clone(), clock.clone(), records.clone(), config.pace).await?;
     plane.put_planner(config.policy).await?;
     let fleet = Arc::new(open_fleet(config, &clock)?);
     let mut robots = JoinSet::new();
@@ -142,6 +182,9 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
         let (telemetry, heartbeat) = (plane.telemetry.clone(), config.heartbeat);
         let robot = Robot::new(body.clone(), clock.clone(), telemetry, RobotConfig { delay: config.delay, heartbeat });
         robots.spawn(robot.run(SWITCHED_ON * number));
+    }
+    if let Some(rule) = config.scenario.charging {
+        plane.change_policies(|policy| rule.change_policy(policy)).await?;
     }
     tokio::time::sleep(WORK_BEGINS + SWITCHED_ON * config.robots as u32).await;
     let source = floor.tasks(config.seed)?;
@@ -157,7 +200,8 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     };
     tokio::pin!(answering);
     let mut progress = ProgressWatch::new(fleet.clone(), records.clone());
-    let mut samples = Vec::new();
+    let mut lost_robots = LostRobots::new(floor.site.clone(), fleet.clone(), config.lasts, config.seed);
+    let (mut breakers, mut samples) = (BreakerWatch::new(config.seed), Vec::new());
     let lasts_ms = config.lasts.as_millis() as u64;
     while clock.elapsed_ms() < lasts_ms {
         tokio::select! {
@@ -170,11 +214,18 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
             }
             () = tokio::time::sleep(LOOK) => {
                 let now = clock.now().site;
-                samples.push(Sample { at_ms: clock.elapsed_ms(), counts: records.counts() });
+                let batteries = config.scenario.charging.map(|_| Batteries::read(&fleet, now)).unwrap_or_default();
+                samples.push(Sample { at_ms: clock.elapsed_ms(), counts: records.counts(), batteries });
                 let is_away = plane.is_planner_away();
                 progress.look_at_robots(now, if is_away { Planning::Stopped } else { Planning::Goes });
-                if config.scenario.faults == BodyFaults::Usual {
+                if config.scenario.faults != BodyFaults::None {
                     fleet.person_round(now, &|task_id: &TaskId| records.is_worked_on(task_id));
+                }
+                if config.scenario.faults != BodyFaults::None && config.answers == Answers::Given {
+                    breakers.look_at_robots(&plane, clock.elapsed_ms()).await?;
+                }
+                if config.scenario.losses == Losses::Two {
+                    lost_robots.look_at_robots(&plane, now).await?;
                 }
                 if let Some(stop) = &config.scenario.planner_stop {
                     let is_away = stop.contains(&Duration::from_millis(clock.elapsed_ms()));
@@ -183,26 +234,53 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
             }
         }
     }
+    let verdicts = if config.robots <= EXPLAINED_MAX { explain_robots(&plane, &fleet).await? } else { BTreeMap::new() };
+    let (tasks, bodies) = (records.tasks(), fleet.report(clock.now().site)?);
     Ok(Outcome {
         robots: config.robots,
         lasted_ms: clock.elapsed_ms(),
-        tasks: records.tasks(),
+        loaded_mm: if bodies.loaded_path_mm > 0 { bodies.loaded_path_mm } else { sum_ways(floor, &tasks) },
+        tasks,
         counts: records.counts(),
         plans: plane.plan_log.plans(),
-        bodies: fleet.report(clock.now().site)?,
+        bodies,
         no_progress: progress.no_progress(),
+        charging: config.scenario.charging,
+        losses: (config.scenario.losses == Losses::Two).then(|| lost_robots.report()),
+        verdicts,
+        reinstated: breakers.reinstated(),
         samples,
         planner_stop: config.scenario.planner_stop.clone(),
         wall: Duration::ZERO,
     })
 }
 
-/// Bodies whose batteries do not empty: no floor of this bench has chargers for them.
+/// What each robot does, or why it does nothing, counted.
+async fn explain_robots(plane: &ControlPlane, fleet: &Fleet) -> anyhow::Result<BTreeMap<String, usize>> {
+    let mut verdicts = BTreeMap::new();
+    for robot in fleet.robots().iter().filter(|_| !plane.is_planner_away()) {
+        *verdicts.entry(plane.explain_robot(robot.robot_id()).await?).or_default() += 1;
+    }
+    Ok(verdicts)
+}
+
+/// The ways of tasks that were done, from the first goal of each to its last. Those to one goal stand beside each other, so
+/// that the way there is looked for once.
+fn sum_ways(floor: &Floor, tasks: &[TaskRecord]) -> u64 {
+    let mut done: Vec<&[WaypointIx]> = tasks.iter().filter(|t| t.done_ms.is_some()).map(|t| &*t.goals).collect();
+    done.sort_by_key(|goals| goals.last().copied());
+    done.into_iter().map(|goals| floor.way_mm(goals)).sum()
+}
+
+/// The bodies. Batteries empty only in the shift of batteries: no other floor has chargers for them.
 fn open_fleet(config: &ShiftConfig, clock: &VirtualClock) -> anyhow::Result<Fleet> {
     let faults = match config.scenario.faults {
         BodyFaults::None => FaultRates::none(),
         BodyFaults::Usual => FaultRates::default(),
+        BodyFaults::Delays => FaultRates { obstacle_per_km: DELAYS_PER_KM, ..FaultRates::none() },
     };
     let of_site = FleetConfig::new(config.floor.site.clone(), config.robots, config.seed);
-    Ok(Fleet::open(&FleetConfig { faults, drains: false, turns: config.turns, ..of_site }, &clock.now())?)
+    let drains = config.scenario.charging.is_some();
+    let energy = if drains { BATTERY_RATES } else { EnergyScale::default() };
+    Ok(Fleet::open(&FleetConfig { faults, drains, energy, turns: config.turns, ..of_site }, &clock.now())?)
 }

@@ -1,6 +1,7 @@
 //! What became of each task of a shift, and who waits for what: fed by every row of a task that fleet commits.
 
 use midshift_core::ids::{RobotId, TaskId};
+use midshift_core::site::WaypointIx;
 use midshift_core::task::TaskState;
 use midshift_core::task::machine::Phase;
 use std::collections::{BTreeMap, BTreeSet};
@@ -21,8 +22,8 @@ pub enum Urgency {
 pub struct TaskRecord {
     /// How urgent it is.
     pub urgency: Urgency,
-    /// The way that it asks for, from its first goal to its last, millimetres.
-    pub way_mm: u64,
+    /// Where it leads, in order.
+    pub goals: Vec<WaypointIx>,
     /// When it was submitted.
     pub submitted_ms: u64,
     /// When a robot was named for it for the first time.
@@ -86,10 +87,10 @@ impl TaskRecords {
     }
 
     /// A task is submitted now.
-    pub fn add(&self, task_id: TaskId, urgency: Urgency, way_mm: u64, now_ms: u64) {
+    pub fn add(&self, task_id: TaskId, urgency: Urgency, goals: Vec<WaypointIx>, now_ms: u64) {
         let record = TaskRecord {
             urgency,
-            way_mm,
+            goals,
             submitted_ms: now_ms,
             assigned_ms: None,
             done_ms: None,
@@ -208,7 +209,7 @@ mod tests {
     #[test]
     fn a_task_that_loses_its_robot_waits_again_and_is_done_once() {
         let records = TaskRecords::default();
-        records.add(TaskId::parse("TASK-1").expect("a valid id"), Urgency::Normal, 5_000, 10);
+        records.add(TaskId::parse("TASK-1").expect("a valid id"), Urgency::Normal, Vec::new(), 10);
         assert_eq!((records.counts().waiting, records.counts().open), (1, 1));
         state(&records, Phase::Assigned, 1, 20);
         assert_eq!((records.counts().waiting, records.busy_robots().len()), (0, 1));

@@ -98,7 +98,7 @@ impl Client {
     }
 
     async fn submit(&mut self) -> anyhow::Result<()> {
-        let (mut request, way_mm) = self.source.next_task();
+        let (mut request, goals) = self.source.next_task();
         self.asked += 1;
         let task_id = TaskId::parse(&format!("TASK-{:07}", self.asked))?;
         let is_urgent = self.rng.random_range(0..1_000) < self.urgent_permille;
@@ -107,7 +107,7 @@ impl Client {
             hurry(&mut request);
         }
         request.task_id = task_id.to_string();
-        self.records.add(task_id, urgency, way_mm, self.clock.elapsed_ms());
+        self.records.add(task_id, urgency, goals, self.clock.elapsed_ms());
         self.tasks.submit_task(local(request)).await?;
         Ok(())
     }
