@@ -245,13 +245,16 @@ fn a_shift_is_the_same_run_again_and_does_each_task_once() {
     let dir = tempfile::tempdir().expect("a directory");
     let sizes = ["--robots", "4", "--hours", "0.1", "--seeds", "1", "--workload", "w2,w6"];
     let (said, figures) = shift(dir.path(), &sizes);
-    assert_eq!(said.matches(": plans ").count(), 2, "{said}");
+    assert_eq!(said.matches(": plans ").count(), 4, "of both policies: {said}");
     assert_eq!(shift(dir.path(), &sizes).0, said, "the same seed, another run");
-    let (two, _) = shift(dir.path(), &["--robots", "4", "--hours", "0.1", "--seeds", "2"]);
+    let (two, _) = shift(dir.path(), &["--robots", "4", "--hours", "0.1", "--seeds", "2", "--policy", "rolling"]);
     let plans: Vec<&str> = two.lines().filter_map(|line| line.split(": plans ").nth(1)).collect();
     assert!(plans.len() == 2 && plans[0] != plans[1], "another seed: {two}");
-    assert!(figures["fifo-nearest W2: tasks"] > 0.0 && figures["fifo-nearest W6: tasks"] > 0.0, "{figures:?}");
-    assert!(figures["fifo-nearest W2: utilisation"] > 95.0, "{figures:?}");
+    for policy in ["fifo-nearest", "rolling"] {
+        let figure = |name: &str| figures[&format!("{policy} {name}")];
+        assert!(figure("W2: tasks") > 0.0 && figure("W6: tasks") > 0.0, "{figures:?}");
+        assert!(figure("W2: utilisation") > 95.0, "{figures:?}");
+    }
     assert_rules_hold(&figures);
 }
 

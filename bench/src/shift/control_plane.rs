@@ -196,27 +196,6 @@ impl ControlPlane {
         let face = &self.planner.as_ref().context("the planner is away")?.face;
         let request = ExplainRobotRequest { robot_id: robot_id.to_string() };
         let explained = face.explain_robot(local(request)).await?.into_inner().explanation.unwrap_or_default();
-<<<<<<< ours
-        if std::env::var("SHIFT_DEBUG").is_ok() && explained.verdict.as_ref().is_some_and(|v| v.code == "FORCED") {
-            let now = midshift_core::time::Clock::now(self.clock.as_ref());
-            for (id, live) in self.board.all() {
-                if id == *robot_id {
-                    eprintln!("now {now:?} live {live:#?}");
-                }
-            }
-            let rows = midshift_store::Store::list(
-                self.plan_log.as_ref(),
-                midshift_store::Query::all(midshift_core::rows::Table::DesiredWork),
-            )
-            .await?;
-            for row in rows {
-                if format!("{:?}", row.key).contains(robot_id.as_str()) {
-                    eprintln!("{row:?}");
-                }
-            }
-        }
-=======
->>>>>>> theirs
         let first = explained.candidates.into_iter().next().and_then(|candidate| candidate.reason);
         Ok(explained.verdict.or(first).map(|reason| reason.code).unwrap_or_default())
     }
