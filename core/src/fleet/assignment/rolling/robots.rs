@@ -27,7 +27,7 @@ const HAND_OVER_MS: u64 = 500;
 /// From when on a robot could do a task.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Free {
-    /// Now.
+    /// It waits for work.
     Now,
     /// Once its errand was broken off.
     AfterErrand,
