@@ -24,7 +24,9 @@ const SIDE: usize = 120;
 const CHARGED_SIDE: usize = 60;
 /// Sizes of fleet, robots.
 const SIZES: [usize; 3] = [100, 1_000, 10_000];
-/// Of what is planned at one moment: how many tasks there are for each robot that nothing can be done about now.
+/// Ready tasks for each robot.
+const READY_EACH: usize = 5;
+/// Tasks for each robot that nothing can be done about now.
 const BLOCKED_EACH: usize = 10;
 /// Battery that is enough for the way to a charger and for no task, permille.
 const LOW_PERMILLE: u16 = 120;
@@ -48,12 +50,39 @@ pub struct PlanArgs {
 /// Which robots and tasks a cycle finds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Fleet {
-    /// Idle robots, and half as many tasks again.
+    /// Idle robots, and five ready tasks for each.
     Idle,
-    /// Robots with too little charge for any task, on a floor with one charger.
-    LowBattery,
+    /// The same on a floor with one charger, where every second robot has too little charge for any task.
+    HalfLow,
+    /// All robots have too little charge.
+    Low,
     /// Idle robots, and tasks whose time has not come.
     Blocked,
+    /// Idle robots, and no task.
+    NoTask,
+}
+
+impl Fleet {
+    const fn tasks_each(self) -> usize {
+        match self {
+            Self::Idle | Self::HalfLow | Self::Low => READY_EACH,
+            Self::Blocked => BLOCKED_EACH,
+            Self::NoTask => 0,
+        }
+    }
+
+    fn is_low(self, nth: usize) -> bool {
+        self == Self::Low || (self == Self::HalfLow && nth % 2 == 1)
+    }
+
+    /// Robots that get a task.
+    const fn offers(self, robots: usize) -> usize {
+        match self {
+            Self::Idle => robots,
+            Self::HalfLow => robots.div_ceil(2),
+            Self::Low | Self::Blocked | Self::NoTask => 0,
+        }
+    }
 }
 
 /// Plans for fleets of several sizes in this process, then asks servers.
@@ -94,33 +123,47 @@ fn cycles(args: &PlanArgs) -> anyhow::Result<Vec<Figure>> {
     let [site, charged] = floors()?;
     let mut figures = Vec::new();
     for robots in SIZES.into_iter().filter(|robots| *robots <= args.largest) {
-        let (mut known, mut new, mut reference) = (Vec::new(), Vec::new(), Vec::new());
-        let (mut low, mut blocked) = (Vec::new(), Vec::new());
+        let mut reference = Vec::new();
+        let mut known: [Vec<f64>; 5] = Default::default();
+        let (mut new, mut contact) = (Vec::new(), Vec::new());
         for round in 0..args.cycles as u64 {
             reference.push(reference_ms());
-            let router = Arc::new(Router::new(site.clone()));
-            new.push(cycle_ms(&site, &router, Fleet::Idle, robots, round));
-            known.push(cycle_ms(&site, &router, Fleet::Idle, robots, round));
-            blocked.push(cycle_ms(&site, &router, Fleet::Blocked, robots, round));
-            let router = Arc::new(Router::new(charged.clone()));
-            low.push(cycle_ms(&charged, &router, Fleet::LowBattery, robots, round));
+            let free = Arc::new(Router::new(site.clone()));
+            let (first, with_no_way) = cycle_ms(&site, &free, Fleet::Idle, robots, round);
+            contact.push(first);
+            new.push(with_no_way);
+            let with_charger = Arc::new(Router::new(charged.clone()));
+            cycle_ms(&charged, &with_charger, Fleet::HalfLow, robots, round);
+            for (fleet, took) in
+                [Fleet::Idle, Fleet::HalfLow, Fleet::Low, Fleet::Blocked, Fleet::NoTask].into_iter().zip(&mut known)
+            {
+                let (site, router) = if matches!(fleet, Fleet::HalfLow | Fleet::Low) {
+                    (&charged, &with_charger)
+                } else {
+                    (&site, &free)
+                };
+                took.push(cycle_ms(site, router, fleet, robots, round).1);
+            }
         }
         let beside: Option<(&str, &[f64])> = Some(("fixed reference loop", &reference));
-        let what = format!("whole cycle, {robots} idle robots, {} tasks", waiting(robots));
-        figures.push(Figure::new("P6", format!("{what}, p50"), "ms", &known, beside));
-        figures.push(Figure::new("P6", format!("{what}, p99"), "ms", &[percentile(&known, 0.99)], beside));
-        figures.push(Figure::new("P6", format!("{what}, no way known yet"), "ms", &new, beside));
-        let what = format!("whole cycle, {robots} robots of low charge, one charger, {} tasks", waiting(robots));
-        figures.push(Figure::new("P6", what, "ms", &low, beside));
-        let what = format!("whole cycle, {robots} idle robots, {} tasks whose time is later", robots * BLOCKED_EACH);
-        figures.push(Figure::new("P6", what, "ms", &blocked, beside));
+        let mut tell = |what: String, took: &[f64]| figures.push(Figure::new("P6", what, "ms", took, beside));
+        let [idle, half_low, low, blocked, no_task] = &known;
+        let ready = robots * READY_EACH;
+        for (what, took) in [
+            (format!("whole cycle, {robots} idle robots, {ready} ready tasks"), idle),
+            (format!("whole cycle, {robots} robots, half of low charge, {ready} ready tasks"), half_low),
+        ] {
+            tell(format!("{what}, p50"), took);
+            tell(format!("{what}, p99"), &[percentile(took, 0.99)]);
+        }
+        tell(format!("whole cycle, {robots} idle robots, {ready} ready tasks, no way known yet"), &new);
+        tell(format!("whole cycle, {robots} robots of low charge, one charger, {ready} ready tasks"), low);
+        let later = robots * BLOCKED_EACH;
+        tell(format!("whole cycle, {robots} idle robots, {later} tasks whose time is later"), blocked);
+        tell(format!("whole cycle, {robots} idle robots, no task"), no_task);
+        tell(format!("whole cycle, {robots} robots heard for the first time"), &contact);
     }
     Ok(figures)
-}
-
-/// Tasks that wait for so many robots.
-fn waiting(robots: usize) -> usize {
-    robots * 3 / 2
 }
 
 /// A fixed amount of dependent integer work: what this machine is worth at this moment.
@@ -141,7 +184,8 @@ fn instant() -> Instant {
     Instant::now()
 }
 
-fn cycle_ms(site: &Arc<Site>, router: &Arc<Router>, kind: Fleet, robots: usize, seed: u64) -> f64 {
+/// Milliseconds of the cycle in which robots are heard for the first time, and of the one in which their tasks are there.
+fn cycle_ms(site: &Arc<Site>, router: &Arc<Router>, kind: Fleet, robots: usize, seed: u64) -> (f64, f64) {
     let now = Now {
         site: SiteTime(60_000),
         link: LinkTime(60_000),
@@ -152,39 +196,47 @@ fn cycle_ms(site: &Arc<Site>, router: &Arc<Router>, kind: Fleet, robots: usize, 
     let (mut view, board) = fleet(site, kind, robots, seed, now);
     view.router = router.clone();
     // One slice for all: what the whole fleet costs, however many turns it is cut into.
-    let mut plan = Plan::for_slice(Slice::for_decisions(2 * robots));
+    let new_plan = || Plan::for_slice(Slice::for_decisions(4 * robots));
+    let mut plan = new_plan();
     ensure_site_rows(&mut view, now, "", &Default::default(), &mut plan);
-    let begun = instant();
-    cycle(&mut view, now, &board, Pace::Wake, &mut plan);
-    let took = begun.elapsed().as_secs_f64() * 1e3;
-    let offers = plan.report.offers as usize;
-    let is_meant = if kind == Fleet::Idle { offers >= robots * 9 / 10 } else { offers == 0 };
+    let timed = |view: &mut FleetProjection, plan: &mut Plan| {
+        let begun = instant();
+        cycle(view, now, &board, Pace::Wake, plan);
+        begun.elapsed().as_secs_f64() * 1e3
+    };
+    let contact = timed(&mut view, &mut plan);
+    add_tasks(&mut view, kind, robots, seed, now);
+    let mut plan = new_plan();
+    let took = timed(&mut view, &mut plan);
+    let (offers, meant) = (plan.report.offers as usize, kind.offers(robots));
+    let is_meant = (meant * 9 / 10..=meant).contains(&offers);
     assert!(is_meant, "a benchmark of another plan than is meant, {kind:?}: {:?}", plan.report);
-    took
+    (contact, took)
 }
 
-fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (FleetProjection, Board) {
-    let tasks = if kind == Fleet::Blocked { robots * BLOCKED_EACH } else { waiting(robots) };
-    let not_before = (kind == Fleet::Blocked).then_some(Utc(now.utc.0 + 3_600_000));
-    let battery_permille = if kind == Fleet::LowBattery { LOW_PERMILLE } else { 900 };
-    let mut view = FleetProjection::new(site.clone(), Now::default(), Now::default());
-    let mut board = Board::new();
+/// Draws from a seed, below a bound.
+fn drawn(seed: u64) -> impl FnMut(usize) -> usize {
     let mut x = seed.wrapping_mul(0x2545_f491_4f6c_dd1d) | 1;
-    let mut draw = |below: usize| {
+    move |below| {
         x ^= x << 13;
         x ^= x >> 7;
         x ^= x << 17;
         (x % below as u64) as usize
-    };
+    }
+}
+
+fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (FleetProjection, Board) {
+    let mut view = FleetProjection::new(site.clone(), Now::default(), Now::default());
+    let mut board = Board::new();
+    let mut draw = drawn(seed);
     let cells = site.waypoints().len();
-    // Goals repeat, as stations do.
-    let goals: Vec<usize> = (0..400).map(|_| draw(cells)).collect();
     for i in 0..robots {
         let robot_id = RobotId::parse(&format!("rbt-{i:05}")).expect("a valid id");
         let inventory =
             Inventory { capabilities: vec!["pick".into(), "place".into()], payload_g: 10_000, ..Inventory::default() };
         let session = Session::new(robot_id.clone(), 1, inventory);
         view.sessions.insert(session.id().into(), RevisedRow { revision: Revision(1), row: session });
+        let battery_permille = if kind.is_low(i) { LOW_PERMILLE } else { 900 };
         let waypoint = Some(site.waypoints()[draw(cells)].waypoint_id.clone());
         let vitals = Vitals { waypoint, battery_permille, ..Vitals::default() };
         let live = NewestHeartbeat {
@@ -198,7 +250,16 @@ fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (
         };
         board.insert(robot_id, Arc::new(live));
     }
-    for i in 0..tasks {
+    (view, board)
+}
+
+fn add_tasks(view: &mut FleetProjection, kind: Fleet, robots: usize, seed: u64, now: Now) {
+    let site = view.site.clone();
+    let mut draw = drawn(seed + 1);
+    let not_before = (kind == Fleet::Blocked).then_some(Utc(now.utc.0 + 3_600_000));
+    // Goals repeat, as stations do.
+    let goals: Vec<usize> = (0..400).map(|_| draw(site.waypoints().len())).collect();
+    for i in 0..robots * kind.tasks_each() {
         let name = |at: usize| site.waypoints()[at].waypoint_id.to_string();
         let form = Transport {
             kind: "transport".into(),
@@ -217,10 +278,9 @@ fn fleet(site: &Arc<Site>, kind: Fleet, robots: usize, seed: u64, now: Now) -> (
             number: i as u64 + 1,
         };
         let state = TaskState::born(&intake);
-        absorb(&mut view, &intake);
-        absorb(&mut view, &state);
+        absorb(view, &intake);
+        absorb(view, &state);
     }
-    (view, board)
 }
 
 /// A row as the store has it.

@@ -118,10 +118,10 @@ pub fn parse(text: &str) -> Result<Site, Refusal> {
         return Err(Refusal::field("file", format!("must be at most {SITE_FILE_BYTES} bytes")));
     }
     let file: RawFile = toml::from_str(text).map_err(|e| {
-        let line = e.span().map_or_else(String::new, |s| format!("line {}", line_of(text, s.start)));
+        let line = e.span().map_or_else(String::new, |s| format!("line {}", Lines::new(text).at(s.start)));
         Refusal::field(if line.is_empty() { "file" } else { &line }, e.message())
     })?;
-    let mut reader = Reader { text, violations: Violations::default() };
+    let mut reader = Reader { lines: Lines::new(text), violations: Violations::default() };
     let areas = reader.many("area", file.area).into_iter().map(area).collect();
     let waypoints = reader.many("waypoint", file.waypoint).into_iter().map(waypoint).collect();
     let mut lanes = Vec::new();
@@ -148,14 +148,14 @@ pub fn parse(text: &str) -> Result<Site, Refusal> {
     draft.build(reader.violations)
 }
 
-struct Reader<'a> {
-    text: &'a str,
+struct Reader {
+    lines: Lines,
     violations: Violations,
 }
 
-impl Reader<'_> {
+impl Reader {
     fn one<T: DeserializeOwned>(&mut self, name: &str, table: Spanned<toml::Table>) -> Option<(String, T)> {
-        let field = format!("{name} (line {})", line_of(self.text, table.span().start));
+        let field = format!("{name} (line {})", self.lines.at(table.span().start));
         match table.into_inner().try_into::<T>() {
             Ok(value) => Some((field, value)),
             Err(e) => {
@@ -169,8 +169,17 @@ impl Reader<'_> {
     }
 }
 
-fn line_of(text: &str, byte: usize) -> usize {
-    1 + text.bytes().take(byte).filter(|b| *b == b'\n').count()
+/// Where the lines of a text end, in bytes. A large site has tens of thousands.
+struct Lines(Vec<usize>);
+
+impl Lines {
+    fn new(text: &str) -> Self {
+        Self(text.match_indices('\n').map(|(byte, _)| byte).collect())
+    }
+    /// Number of the line in which a byte is, from 1.
+    fn at(&self, byte: usize) -> usize {
+        1 + self.0.partition_point(|end| *end < byte)
+    }
 }
 
 fn area((field, raw): (String, RawArea)) -> DraftArea {

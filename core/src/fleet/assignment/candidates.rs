@@ -3,6 +3,7 @@
 //! Called by `assign` for tasks and by `errands` for the robots that are left. Invariant: who is taken depends on distance, tasks so far and id,
 //! never on the order in which robots were met.
 
+use super::demand::Demand;
 use super::filters;
 use crate::fleet::decision::slice::Slice;
 use crate::fleet::projection::liveness::Board;
@@ -90,9 +91,10 @@ impl Pool {
             let distance = field.as_ref().map_or(Some(0), |f| f.distance_mm(at))?;
             Some((failed(ix), distance, tasks, ix))
         };
+        let demand = Demand::new(view, task, intake);
         let mut passes = |nth: &usize| {
             slice.count_looks(1);
-            filters::pair(view, board, &self.all[self.left[*nth].0].robot_id, task, intake, now).is_ok()
+            filters::pair(view, board, &self.all[self.left[*nth].0].robot_id, &demand, now).is_ok()
         };
         // Nearly always the first one passes; only else are all put in order.
         let mut first = None;

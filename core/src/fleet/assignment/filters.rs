@@ -2,13 +2,13 @@
 //!
 //! Invariant: a filter gives a reason; nothing is ever "just not chosen".
 
-use crate::energy::Trip;
+use super::demand::Demand;
 use crate::fleet::facts::{disbelief, maps, repair, unanswered_offers};
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::queue::Wait;
 use crate::fleet::projection::rows::RobotHolder;
 use crate::fleet::projection::state::FleetProjection;
-use crate::fleet::tasks::eligibility::{another_could, decided_by_people, fits, reported};
+use crate::fleet::tasks::eligibility::{another_could, bound, decided_by_people, fits, reported};
 use crate::fleet::tasks::{claims, load, plausible};
 use crate::fleet::traffic::{engaged_stops, routing};
 use crate::heartbeat::NewestHeartbeat;
@@ -17,7 +17,6 @@ use crate::limits;
 use crate::presence::Presence;
 use crate::reason::{Code, Reason};
 use crate::site::WaypointIx;
-use crate::step::StepKind;
 use crate::task::{AttemptPhase, Phase, TaskIntake, TaskState};
 use crate::time::Now;
 
@@ -76,14 +75,26 @@ pub fn pair(
     view: &FleetProjection,
     board: &Board,
     robot_id: &RobotId,
-    task: &TaskState,
-    intake: &TaskIntake,
+    demand: &Demand<'_>,
     now: &Now,
 ) -> Result<(), Reason> {
     let Some(session) = view.sessions.get(robot_id.as_str()).map(|s| &s.row) else {
         return Err(Code::RobotOffline.into());
     };
-    fits(view, session, task, intake)?;
+    fits(view, session, demand.task, demand.intake)?;
+    pair_if_able(view, board, robot_id, demand, now)
+}
+
+/// As [`pair`], of a robot that has what the task needs.
+pub(super) fn pair_if_able(
+    view: &FleetProjection,
+    board: &Board,
+    robot_id: &RobotId,
+    demand: &Demand<'_>,
+    now: &Now,
+) -> Result<(), Reason> {
+    let Demand { task, intake, .. } = demand;
+    bound(robot_id, task, intake)?;
     prefer_others(view, robot_id, task, intake, now)?;
     let Some(live) = board.get(robot_id) else { return Err(Code::RobotOffline.into()) };
     just_refused(view, live, task)?;
@@ -93,22 +104,21 @@ pub fn pair(
     {
         return Err(load::explain_load(view, robot_id, load));
     }
-    let (here, goals) = journey(view, live, task, intake)?;
-    place(view, here, &goals)?;
-    let legs_mm = routing::legs_mm(view, here, &goals).ok_or(Code::NoRoute)?;
-    if routing::is_too_long(view, here, &goals, legs_mm.iter().sum()) {
+    let here = routing::find(view, live.report.vitals.waypoint.as_ref()).ok_or(Code::RobotUnlocated)?;
+    let goals = demand.goals()?;
+    place(view, here, goals)?;
+    if routing::is_too_long(view, here, goals, demand.legs_mm(here)?.sum()) {
         return Err(Reason::from(Code::RouteTooLong).with("points_max", limits::ROUTE_POINTS_MAX));
     }
-    let from = crate::step::from_step(&intake.spec.steps, task.next_step) as usize;
-    let mut trip = Trip::new(load.is_some(), intake.spec.speed_limit_mm_s);
-    let mut legs_mm = legs_mm.into_iter();
-    for step in intake.spec.steps.iter().skip(from) {
-        match &step.kind {
-            StepKind::Goto { .. } => trip.drive(legs_mm.next().unwrap_or(0)),
-            step => trip.act(step),
-        }
+    // The charge must last for all of it and the way to a charger behind it, with a reserve.
+    let Some(trip) = demand.trip_home(view, here, load.is_some())? else { return Ok(()) };
+    let mandatory = u64::from(view.policy(&view.site.area_of(here).area_id).charge_mandatory_permille);
+    let needed = (trip.needed_permille() + RESERVE_PERMILLE).max(mandatory);
+    let has = u64::from(live.report.vitals.battery_permille);
+    if has < needed {
+        return Err(Reason::from(Code::BatteryLow).with("battery_permille", has).with("needed_permille", needed));
     }
-    energy(view, live, here, goals.last().copied().unwrap_or(here), trip)
+    Ok(())
 }
 
 /// Keeps a task for a while from a robot that failed it, as long as another could do it.
@@ -145,19 +155,6 @@ fn just_refused(view: &FleetProjection, live: &NewestHeartbeat, task: &TaskState
     }
 }
 
-/// Where the robot stands, and the goals that are left.
-fn journey(
-    view: &FleetProjection,
-    live: &NewestHeartbeat,
-    task: &TaskState,
-    intake: &TaskIntake,
-) -> Result<(WaypointIx, Vec<WaypointIx>), Reason> {
-    let here = routing::find(view, live.report.vitals.waypoint.as_ref()).ok_or(Code::RobotUnlocated)?;
-    let from = crate::step::from_step(&intake.spec.steps, task.next_step);
-    let goals: Option<Vec<WaypointIx>> = intake.spec.goals(from as usize).map(|g| view.site.find(g)).collect();
-    Ok((here, goals.ok_or(Code::NoRoute)?))
-}
-
 /// No closed place may bar the way to a goal, nor be one.
 fn place(view: &FleetProjection, here: WaypointIx, goals: &[WaypointIx]) -> Result<(), Reason> {
     let closed = routing::closed(view);
@@ -170,32 +167,6 @@ fn place(view: &FleetProjection, here: WaypointIx, goals: &[WaypointIx]) -> Resu
             return Err(Reason::from(Code::PlaceOccupied).with("goal", view.site.name_of(*goal)));
         }
         at = *goal;
-    }
-    Ok(())
-}
-
-/// The charge must last for all steps and the way from the last goal to the nearest charger, with its reserve; no goal may be one from which
-/// no charger can be reached. A site without chargers has no way home.
-fn energy(
-    view: &FleetProjection,
-    live: &NewestHeartbeat,
-    here: WaypointIx,
-    last: WaypointIx,
-    mut trip: Trip,
-) -> Result<(), Reason> {
-    if view.site.chargers().next().is_none() {
-        return Ok(());
-    }
-    let home_mm = view.site.chargers().filter_map(|charger| view.router.distance_mm(last, charger)).min();
-    let no_way = || Reason::from(Code::NoRoute).with("goal", view.site.name_of(last)).with("to", "a charger");
-    trip.drive(home_mm.ok_or_else(no_way)?);
-    let needed = trip.needed_permille() + RESERVE_PERMILLE;
-    let has = u64::from(live.report.vitals.battery_permille);
-    let mandatory = u64::from(view.policy(&view.site.area_of(here).area_id).charge_mandatory_permille);
-    if has < needed.max(mandatory) {
-        return Err(Reason::from(Code::BatteryLow)
-            .with("battery_permille", has)
-            .with("needed_permille", needed.max(mandatory)));
     }
     Ok(())
 }

@@ -1,6 +1,7 @@
 //! Why a task is not running and why a robot has no work: the planner's own filters, run again for one of them. Stores nothing.
 
 use super::wait_reasons;
+use crate::fleet::assignment::demand::Demand;
 use crate::fleet::assignment::filters;
 use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::facts::misreads;
@@ -58,11 +59,12 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
         .spec
         .next_goal(crate::step::from_step(&intake.spec.steps, task.next_step) as usize)
         .and_then(|g| view.site.find(g));
+    let demand = Demand::new(view, task, intake);
     let mut candidates = Vec::new();
     let mut filtered = BTreeMap::new();
     let robots = waits.then(|| screened(view, board, now));
     for (robot_id, against) in robots.into_iter().flatten() {
-        let reason = filters::pair(view, board, robot_id, task, intake, now).err().or_else(|| against.clone());
+        let reason = filters::pair(view, board, robot_id, &demand, now).err().or_else(|| against.clone());
         let reason = reason.map(|why| closed_places::name_closed(view, why));
         if let Some(reason) = &reason {
             *filtered.entry(reason.code).or_default() += 1;
@@ -186,7 +188,7 @@ pub fn robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotI
         let task = view.task(task_id)?;
         let intake = view.intake(task_id)?;
         let reason = filters::task(view, board, task, intake, now)
-            .and_then(|()| filters::pair(view, board, robot_id, task, intake, now))
+            .and_then(|()| filters::pair(view, board, robot_id, &Demand::new(view, task, intake), now))
             .err()
             .map(|why| closed_places::name_closed(view, why));
         let goal = intake

@@ -4,6 +4,7 @@
 //! without a reason for [`limits::UNEXPLAINED_AFTER`] is counted once, until it has a reason again.
 
 use super::wait_reasons;
+use crate::fleet::assignment::demand::Demand;
 use crate::fleet::assignment::filters;
 use crate::fleet::decision::plan::Plan;
 use crate::fleet::projection::liveness::Board;
@@ -79,6 +80,9 @@ fn is_explained<'a>(
     match wait_reasons::of_task(view, board, now, task, intake) {
         Some(why) => wait_reasons::is_told(&why),
         None if task.phase != Phase::Queued => false,
-        None => idle().iter().all(|robot_id| filters::pair(view, board, robot_id, task, intake, now).is_err()),
+        None => {
+            let demand = Demand::new(view, task, intake);
+            idle().iter().all(|robot_id| filters::pair(view, board, robot_id, &demand, now).is_err())
+        }
     }
 }

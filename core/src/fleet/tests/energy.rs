@@ -1,6 +1,7 @@
 //! Charge for a task and for the way to a charger after it.
 
 use super::*;
+use crate::fleet::assignment::demand::Demand;
 use crate::fleet::assignment::filters;
 use crate::reason::Code;
 use crate::task::Phase;
@@ -15,7 +16,14 @@ fn dead_end() -> String {
 fn why_not(rig: &Rig) -> Option<Reason> {
     let task_id = TaskId::parse("T1").expect("an id");
     let (task, intake) = rig.view.task(&task_id).zip(rig.view.intake(&task_id)).expect("a task");
-    filters::pair(&rig.view, &rig.board, &RobotId::parse("r1").expect("an id"), task, intake, &rig.now).err()
+    filters::pair(
+        &rig.view,
+        &rig.board,
+        &RobotId::parse("r1").expect("an id"),
+        &Demand::new(&rig.view, task, intake),
+        &rig.now,
+    )
+    .err()
 }
 
 fn rig_on(text: &str) -> Rig {

@@ -6,15 +6,16 @@
 
 use super::cost::{self, Urgency};
 use super::robots::{Free, ROBOTS_MAX, Robot};
+use crate::fleet::assignment::demand::Demand;
 use crate::fleet::assignment::filters;
 use crate::fleet::decision::slice::Slice;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::queue::Rank;
-use crate::fleet::projection::ready::Need;
+use crate::fleet::projection::ready::{Need, ReadyTask};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::eligibility;
 use crate::fleet::traffic::routing;
-use crate::ids::TaskId;
+use crate::ids::{RobotId, TaskId};
 use crate::planner_policy::PlannerPolicy;
 use crate::site::WaypointIx;
 use crate::time::Now;
@@ -50,8 +51,6 @@ pub struct Choices {
     pub urgencies: Vec<Urgency>,
     /// Pairs, each once.
     pub pairs: Vec<Choice>,
-    known: BTreeMap<TaskId, usize>,
-    seen: BTreeSet<(usize, usize)>,
 }
 
 /// What a plan is made of.
@@ -65,6 +64,21 @@ pub struct Scene<'a> {
     pub policy: &'a PlannerPolicy,
     /// Robots, by id.
     pub robots: &'a [Robot],
+}
+
+/// A ready task that was looked at, and that may be given.
+struct Looked<'a> {
+    demand: Demand<'a>,
+    /// Robots that have what it needs.
+    able: Rc<[bool]>,
+    /// For whom it was meant in the plan before.
+    meant_for: Option<&'a RobotId>,
+    /// It was meant for one robot or another for too long.
+    is_overdue: bool,
+    /// Where it stands among the tasks with a pair.
+    nth: Option<usize>,
+    /// Robots with which it makes a pair.
+    robots: BTreeSet<usize>,
 }
 
 /// Ready tasks of one need that begin at one goal.
@@ -101,6 +115,8 @@ pub struct Finder<'a> {
     /// Robots that have what is needed, by need.
     able: BTreeMap<&'a Arc<Need>, Rc<[bool]>>,
     near: BTreeMap<(&'a Arc<Need>, Option<WaypointIx>), Near>,
+    /// Tasks that were looked at; none: what it is keeps the task from every robot.
+    looked: BTreeMap<&'a TaskId, Option<Looked<'a>>>,
     found: Choices,
 }
 
@@ -117,6 +133,7 @@ impl<'a> Finder<'a> {
             spots: spots.collect(),
             able: BTreeMap::new(),
             near: BTreeMap::new(),
+            looked: BTreeMap::new(),
             found: Choices::default(),
         }
     }
@@ -214,50 +231,64 @@ impl<'a> Finder<'a> {
     /// Adds a pair unless something stands against it. Of a robot that is free everything is asked.
     pub fn add_pair(&mut self, robot: usize, task_id: &TaskId) -> bool {
         let (view, Scene { board, now, policy, robots }) = (self.view, self.scene);
-        let known = self.found.known.get(task_id).copied();
-        if known.is_some_and(|known| self.found.seen.contains(&(robot, known))) {
+        let Some(ready) = view.ready.get(task_id) else { return false };
+        let task_id = &ready.rank.task_id;
+        if !self.looked.contains_key(task_id) {
+            let looked = self.look_at(ready);
+            self.looked.insert(task_id, looked);
+        }
+        let Some(Some(looked)) = self.looked.get_mut(task_id) else { return false };
+        if looked.robots.contains(&robot) {
             return true;
         }
-        let Some((task, intake)) = view.task(task_id).zip(view.intake(task_id)) else { return false };
-        let Some(ready) = view.ready.get(task_id) else { return false };
-        let Robot { robot_id, at, free, is_low, .. } = &robots[robot];
-        let is_fit = !is_low
+        let Robot { robot_id, at, free, .. } = &robots[robot];
+        let Demand { task, intake, .. } = looked.demand;
+        let is_fit = looked.able[robot]
             && match free {
-                Free::Now | Free::AfterErrand => filters::pair(view, board, robot_id, task, intake, &now).is_ok(),
-                Free::Soon if view.meant.is_over(task_id, now.site) => false,
-                Free::Soon => {
-                    let session = view.sessions.get(robot_id.as_str());
-                    session.is_some_and(|s| eligibility::fits(view, &s.row, task, intake).is_ok())
+                Free::Now | Free::AfterErrand => {
+                    filters::pair_if_able(view, board, robot_id, &looked.demand, &now).is_ok()
                 }
+                Free::Soon => !looked.is_overdue && eligibility::bound(robot_id, task, intake).is_ok(),
             };
         let Some(way_mm) = way_mm(view, *at, ready.goal).filter(|_| is_fit) else { return false };
-        if known.is_none() && filters::task(view, board, task, intake, &now).is_err() {
-            return false;
-        }
-        let known = known.unwrap_or_else(|| {
+        let nth = *looked.nth.get_or_insert_with(|| {
             let Rank { class, since, .. } = ready.rank;
             self.found.urgencies.push(Urgency { class, since, deadline: intake.spec.deadline });
             self.found.tasks.push(task_id.clone());
-            self.found.known.insert(task_id.clone(), self.found.tasks.len() - 1);
             self.found.tasks.len() - 1
         });
-        self.found.seen.insert((robot, known));
+        looked.robots.insert(robot);
         let pair = cost::Pair {
             way_mm,
             has_failed: task.failed_robots.contains(robot_id),
-            is_meant: view.meant.get(task_id).is_some_and(|meant| meant.robot_id == *robot_id),
+            is_meant: looked.meant_for == Some(robot_id),
         };
-        let cost = cost::of_pair(policy, &now, &robots[robot], &self.found.urgencies[known], &pair);
-        self.found.pairs.push(Choice { robot, task: known, cost });
+        let cost = cost::of_pair(policy, &now, &robots[robot], &self.found.urgencies[nth], &pair);
+        self.found.pairs.push(Choice { robot, task: nth, cost });
         true
     }
 
-    /// Which robots have what a task needs: the same for all tasks of the need.
+    /// What is known of a ready task, unless something stands against it whatever the robot.
+    fn look_at(&mut self, ready: &'a ReadyTask) -> Option<Looked<'a>> {
+        let (view, Scene { board, now, .. }, task_id) = (self.view, self.scene, &ready.rank.task_id);
+        let (task, intake) = view.task(task_id).zip(view.intake(task_id))?;
+        filters::task(view, board, task, intake, &now).ok()?;
+        Some(Looked {
+            demand: Demand::new(view, task, intake),
+            able: self.find_able(&ready.need, &ready.rank),
+            meant_for: view.meant.get(task_id).map(|meant| &meant.robot_id),
+            is_overdue: view.meant.is_over(task_id, now.site),
+            nth: None,
+            robots: BTreeSet::new(),
+        })
+    }
+
+    /// Which robots have what a task needs, and charge for any: the same for all tasks of the need.
     fn find_able(&mut self, need: &'a Arc<Need>, of_task: &Rank) -> Rc<[bool]> {
         let (view, robots) = (self.view, self.scene.robots);
         let is_able = |robot: &Robot, intake| {
             let session = view.sessions.get(robot.robot_id.as_str());
-            session.is_some_and(|s| eligibility::able(view, &s.row, intake).is_ok())
+            !robot.is_low && session.is_some_and(|s| eligibility::able(view, &s.row, intake).is_ok())
         };
         let able = self.able.entry(need).or_insert_with(|| {
             let intake = view.intake(&of_task.task_id);
