@@ -245,6 +245,7 @@ codes! {
     DrainSuspend = "DRAIN_SUSPEND", "The robot is taken out of work; the task goes on with another.";
     SkippedBusy = "SKIPPED_BUSY", "The robot could not be had in time: a step that may not be interrupted, a load, or a task that may not wait. It works on.";
     BatterySuspend = "BATTERY_SUSPEND", "The robot goes to charge first.";
+    UrgentSuspend = "URGENT_SUSPEND", "An urgent task takes the robot; this one goes on afterwards, with whichever robot is nearest.";
     // --- why a robot is left out of a roll-out
     SkippedOffline = "SKIPPED_OFFLINE", "The robot was not heard when its turn came. It is tried once more at the end.";
     SkippedStuck = "SKIPPED_STUCK", "The robot did not get as far as it should in time: its download, or what it needs to activate. It is tried once more at the end.";

@@ -23,7 +23,11 @@ pub fn plan(
 ) -> Vec<Candidate> {
     let policy = view.planner();
     match policy.policy {
-        AssignmentPolicy::Rolling if !view.queue.is_empty() => rolling::plan(view, board, now, heard, &policy, plan),
+        AssignmentPolicy::Rolling if !view.queue.is_empty() => {
+            let idle = rolling::plan(view, board, now, heard, &policy, plan);
+            rolling::preemption::plan(view, board, now, &policy, plan);
+            idle
+        }
         AssignmentPolicy::Rolling | AssignmentPolicy::FifoNearest => {
             view.meant.put_plan(Vec::new(), now.site);
             nearest::plan(view, board, now, heard, plan)

@@ -107,6 +107,8 @@ projection! {
         lasting: Lasting = Lasting::new();
         /// Robots that ready tasks are meant for once those are free.
         meant: Meant = Meant::default();
+        /// Tasks that gave way to an urgent one, and when, site clock.
+        gave_way: BTreeMap<TaskId, crate::time::SiteTime> = BTreeMap::new();
         /// What stands without a reason.
         unexplained: Unexplained = Unexplained::default();
         /// The attempt that a robot lists and no row knows, and since when, link clock.

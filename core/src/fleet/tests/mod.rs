@@ -13,6 +13,7 @@ mod misreads;
 mod opened;
 mod order;
 mod planner;
+mod preemption;
 mod rolling;
 mod unexplained;
 

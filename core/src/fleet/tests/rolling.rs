@@ -11,13 +11,13 @@ use crate::task::state::Errand;
 use std::collections::BTreeSet;
 
 /// A line of cells, `c0` to `c199`, a metre each, that robots drive along at 1 m/s.
-fn line() -> Rig {
+pub(super) fn line() -> Rig {
     let map = format!("type octile\nheight 1\nwidth 200\nmap\n{}\n", ".".repeat(200));
     Rig::of_site(Arc::new(grid::parse_map("line", &map).expect("a map")))
 }
 
 /// Goes to these cells, one after the other.
-fn visits(cells: &[u32]) -> impl FnOnce(&mut RawTask) {
+pub(super) fn visits(cells: &[u32]) -> impl FnOnce(&mut RawTask) {
     let goto = |cell| RawStep { kind: Some(RawStepKind::Goto(format!("c{cell}"))), ..RawStep::default() };
     let steps = cells.iter().map(goto).collect();
     |raw| raw.steps = steps

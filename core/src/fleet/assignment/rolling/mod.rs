@@ -4,13 +4,14 @@
 //! meant for them is memory of this process, no row and no promise.
 //!
 //! In reading order: `robots` that may take something; what a pair costs (`cost`); which pairs are weighed (`choices`); the
-//! pairs of least cost (`least_cost`). Called by `assign`. Invariants:
+//! pairs of least cost (`least_cost`); what gives way to urgent tasks (`preemption`). Called by `assign`. Invariants:
 //! 1. A task of a higher class goes first, and as many tasks are given as can be.
 //! 2. The same rows, heartbeats and memory give the same pairs, in whatever order they came.
 
 mod choices;
 mod cost;
 mod least_cost;
+pub mod preemption;
 mod robots;
 
 use super::candidates::Candidate;

@@ -2,16 +2,21 @@
 //!
 //! Invariant: only a robot that is free gets an offer; the others keep tasks from going to a robot that is farther away.
 
-use crate::fleet::assignment::estimate::Rest;
+use crate::energy;
+use crate::fleet::assignment::estimate::{Rest, USUAL_MM_S};
 use crate::fleet::assignment::filters;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::state::FleetProjection;
+use crate::fleet::tasks::transitions::may_suspend;
 use crate::fleet::traffic::routing;
 use crate::heartbeat::NewestHeartbeat;
-use crate::ids::{AttemptId, RobotId, Subject};
+use crate::ids::{AttemptId, RobotId, Subject, TaskId};
 use crate::site::WaypointIx;
-use crate::task::AttemptPhase;
+use crate::step::StepKind;
+use crate::task::machine::AfterStopping;
+use crate::task::spec::Class;
 use crate::task::state::Errand;
+use crate::task::{Attempt, AttemptPhase, TaskIntake};
 use crate::time::Now;
 
 /// Robots that are weighed against all tasks at once. Of more of them each task looks for the nearest.
@@ -76,17 +81,39 @@ pub fn find_free(view: &FleetProjection, board: &Board, now: &Now) -> Vec<Robot>
     board.keys().filter_map(robot).collect()
 }
 
-/// Robots that break off their errand, by id: most are meant for a task already.
+/// Robots that break off their errand, or whose task is suspended, by id: most are meant for a task already.
 pub fn find_stopping(view: &FleetProjection, board: &Board, now: &Now) -> Vec<Robot> {
     let robot = |(robot_id, attempt): (&RobotId, &AttemptId)| {
-        let is_errand = matches!(attempt.subject, Subject::Errand { .. });
-        let known = view.attempt(attempt).filter(|_| is_errand)?;
+        let known = view.attempt(attempt)?;
         if known.phase != AttemptPhase::Stopping || known.accepted.is_none() {
             return None;
         }
         filters::in_work(view, board, robot_id, now).ok()?;
-        let at = routing::find(view, board.get(robot_id)?.report.vitals.waypoint.as_ref())?;
-        Some(robot(view, robot_id, at, Free::Soon, RECALL_MS))
+        let live = board.get(robot_id)?;
+        let here = routing::find(view, live.report.vitals.waypoint.as_ref())?;
+        let Some(task_id) = attempt.subject.task_id() else {
+            return Some(robot(view, robot_id, here, Free::Soon, RECALL_MS));
+        };
+        let is_suspended = view.task(task_id).is_some_and(|task| task.then == Some(AfterStopping::Suspended));
+        let (ready_ms, at) = ends_step(view, attempt, live, here).filter(|_| is_suspended)?;
+        (!is_low(view, live, at)).then(|| robot(view, robot_id, at, Free::Soon, ready_ms))
+    };
+    view.robots_at_work().filter_map(robot).collect()
+}
+
+/// Robots whose task may be suspended for an urgent one, by id, with that task.
+pub fn find_interruptible(view: &FleetProjection, board: &Board, now: &Now) -> Vec<(TaskId, Robot)> {
+    let robot = |(robot_id, attempt): (&RobotId, &AttemptId)| {
+        let (task_id, live) = (attempt.subject.task_id()?, board.get(robot_id)?);
+        let is_urgent = |task: &TaskIntake| Class::from_priority(task.spec.priority, 0) == Class::Urgent;
+        let is_certain = view.attempt(attempt)?.uncertain.is_none();
+        if view.intake(task_id).is_none_or(is_urgent) || !is_certain || !may_suspend(view, task_id, live) {
+            return None;
+        }
+        filters::in_work(view, board, robot_id, now).ok()?;
+        let here = routing::find(view, live.report.vitals.waypoint.as_ref())?;
+        let (ready_ms, at) = ends_step(view, attempt, live, here)?;
+        (!is_low(view, live, at)).then(|| (task_id.clone(), robot(view, robot_id, at, Free::Soon, ready_ms)))
     };
     view.robots_at_work().filter_map(robot).collect()
 }
@@ -141,12 +168,36 @@ fn ends_soon(
         return None;
     }
     let (intake, live) = (view.intake(task_id)?, board.get(robot_id)?);
-    let listed = live.report.attempts.iter().find(|listed| listed.attempt == *attempt);
-    let step = listed.map_or(known.step_index, |listed| listed.step_index.max(known.step_index));
-    if intake.spec.goals(step as usize).nth(1).is_some() {
+    let step = step_of(known, live);
+    if intake.spec.goals(step).nth(1).is_some() {
         return None;
     }
-    let rest = Rest::of_task(view, intake, step as usize, live);
+    let rest = Rest::of_task(view, intake, step, live);
     let ready_ms = rest.usual_ms() + HAND_OVER_MS;
     (ready_ms <= horizon_ms).then_some((ready_ms, rest.ends_at?))
+}
+
+/// When and where the robot ends the step that it is at.
+fn ends_step(
+    view: &FleetProjection,
+    attempt: &AttemptId,
+    live: &NewestHeartbeat,
+    here: WaypointIx,
+) -> Option<(u64, WaypointIx)> {
+    let step = view.intake(attempt.subject.task_id()?)?.spec.steps.get(step_of(view.attempt(attempt)?, live))?;
+    let (step_ms, at) = match &step.kind {
+        StepKind::Goto { waypoint } => {
+            let goal = view.site.find(waypoint)?;
+            (view.router.distance_mm(here, goal)? * 1_000 / USUAL_MM_S, goal)
+        }
+        StepKind::Wait { duration_ms } => (*duration_ms, here),
+        StepKind::Action { .. } => (energy::HANDLE.as_ms(), here),
+    };
+    Some((step_ms + HAND_OVER_MS, at))
+}
+
+/// The step that a robot is at, as it says or as it is known.
+fn step_of(known: &Attempt, live: &NewestHeartbeat) -> usize {
+    let listed = live.report.attempts.iter().find(|listed| listed.attempt == known.attempt);
+    listed.map_or(known.step_index, |listed| listed.step_index.max(known.step_index)) as usize
 }
