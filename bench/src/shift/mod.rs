@@ -221,6 +221,7 @@ pub fn run(args: &ShiftArgs, say: &dyn Fn(&str)) -> anyhow::Result<Vec<Figure>> 
                 let told: Vec<_> = outcomes.iter().map(measures::measures).collect();
                 let reference = args.reference_per_hour.filter(|_| *workload == Workload::W2);
                 figures.extend(measures::figures(&title, &told, reference));
+                figures.extend(measures::backlog_figures(&title, &outcomes));
                 courses.push(Course::new(title, &outcomes));
             }
         }
@@ -237,7 +238,7 @@ fn describe_end(title: &str, seed: u64, outcome: &Outcome) -> String {
     let open =
         outcome.open_tasks().into_iter().map(|((phase, why), n)| format!("{n} {phase} {why}").trim_end().to_owned());
     let robots = outcome.verdicts.iter().map(|(code, n)| format!("{n} {code}").trim_end().to_owned());
-    let PlansNoted { hash, items, .. } = outcome.plans;
+    let PlansNoted { hash, items, .. } = outcome.end.plans;
     let (open, robots) = (list(open.collect()), list(robots.collect()));
     format!("{title}, seed {seed}: plans {hash:016x}, {items} items; open tasks: {open}; robots: {robots}")
 }

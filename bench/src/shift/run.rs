@@ -15,10 +15,10 @@ use super::robot::{Robot, RobotConfig};
 use super::scenario::{BATTERY_RATES, BodyFaults, ChargingRule, Losses, Scenario};
 use super::task_records::{TaskCounts, TaskRecord, TaskRecords};
 use super::workload::Client;
-use anyhow::bail;
+use anyhow::{Context as _, bail};
 use midshift_agent::body::Body as _;
 use midshift_core::ids::TaskId;
-use midshift_core::site::WaypointIx;
+use midshift_core::site::{Source, WaypointIx};
 use midshift_core::time::{Clock, SiteTime};
 use midshift_proto::fleet::v1::AssignmentPolicy;
 use midshift_sim::energy::EnergyScale;
@@ -107,17 +107,12 @@ impl Batteries {
     }
 }
 
-/// What came of a shift.
-pub struct Outcome {
-    /// Robots that there were.
-    pub robots: usize,
-    /// How long it lasted, milliseconds.
-    pub lasted_ms: u64,
-    /// Driven with a load; where nothing is carried, the ways that tasks asked for between their goals. Millimetres.
-    pub loaded_mm: u64,
-    /// Every task.
-    pub tasks: Vec<TaskRecord>,
-    /// Tasks at the end.
+/// What was counted from the beginning of a shift up to one moment.
+#[derive(Clone)]
+pub struct Totals {
+    /// That moment, milliseconds since the beginning.
+    pub at_ms: u64,
+    /// Tasks.
     pub counts: TaskCounts,
     /// What was planned.
     pub plans: PlansNoted,
@@ -125,15 +120,34 @@ pub struct Outcome {
     pub bodies: FleetReport,
     /// Robots with a task that came on with nothing.
     pub no_progress: NoProgress,
+    /// Robots that a person let work again after their breaker had opened.
+    pub reinstated: u64,
+}
+
+/// What came of a shift.
+pub struct Outcome {
+    /// Robots that there were.
+    pub robots: usize,
+    /// The floor is a grid.
+    pub is_grid: bool,
+    /// Up to the beginning of the measured time.
+    pub begin: Totals,
+    /// Up to its end, which is that of the shift.
+    pub end: Totals,
+    /// Driven with a load within the measured time; where nothing is carried, the ways that tasks asked for between their
+    /// goals which were done in it. Millimetres.
+    pub loaded_mm: u64,
+    /// Every task of the whole shift.
+    pub tasks: Vec<TaskRecord>,
+    /// Whether bodies failed.
+    pub faults: BodyFaults,
     /// When robots charged; none: batteries did not empty.
     pub charging: Option<ChargingRule>,
     /// Of robots that were lost; none: none were to be.
     pub losses: Option<LossReport>,
     /// Robots at the end by the code of what they do, or of why they do nothing. Empty: too many to ask.
     pub verdicts: BTreeMap<String, usize>,
-    /// Robots that a person let work again after their breaker had opened.
-    pub reinstated: u64,
-    /// The fleet over time.
+    /// The fleet over the whole shift.
     pub samples: Vec<Sample>,
     /// When the planner was away.
     pub planner_stop: Option<Range<Duration>>,
@@ -151,6 +165,9 @@ impl Outcome {
         open
     }
 }
+
+/// A shift is measured after its first part, which fills the floor with work: a tenth of it, at most so long.
+const WARM_UP: Duration = Duration::from_secs(600);
 
 /// Runs one shift.
 ///
@@ -203,6 +220,14 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     let mut lost_robots = LostRobots::new(floor.site.clone(), fleet.clone(), config.lasts, config.seed);
     let (mut breakers, mut samples) = (BreakerWatch::new(config.seed), Vec::new());
     let lasts_ms = config.lasts.as_millis() as u64;
+    let warm_up_ms = (config.lasts / 10).min(WARM_UP).as_millis() as u64;
+    let read_totals = |plane: &ControlPlane, progress: &ProgressWatch, breakers: &BreakerWatch| {
+        let bodies = fleet.report(clock.now().site)?;
+        let (at_ms, counts, plans) = (clock.elapsed_ms(), records.counts(), plane.plan_log.plans());
+        let (no_progress, reinstated) = (progress.no_progress(), breakers.reinstated());
+        anyhow::Ok(Totals { at_ms, counts, plans, bodies, no_progress, reinstated })
+    };
+    let mut begin = None;
     while clock.elapsed_ms() < lasts_ms {
         tokio::select! {
             biased;
@@ -231,24 +256,27 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
                     let is_away = stop.contains(&Duration::from_millis(clock.elapsed_ms()));
                     if is_away { plane.stop_planner().await? } else { plane.start_planner() }
                 }
+                if begin.is_none() && clock.elapsed_ms() >= warm_up_ms {
+                    begin = Some(read_totals(&plane, &progress, &breakers)?);
+                }
             }
         }
     }
+    let (tasks, end) = (records.tasks(), read_totals(&plane, &progress, &breakers)?);
+    let begin = begin.context("the shift ended before anything was measured")?;
     let verdicts = if config.robots <= EXPLAINED_MAX { explain_robots(&plane, &fleet).await? } else { BTreeMap::new() };
-    let (tasks, bodies) = (records.tasks(), fleet.report(clock.now().site)?);
+    let carried_mm = end.bodies.loaded_path_mm - begin.bodies.loaded_path_mm;
     Ok(Outcome {
         robots: config.robots,
-        lasted_ms: clock.elapsed_ms(),
-        loaded_mm: if bodies.loaded_path_mm > 0 { bodies.loaded_path_mm } else { sum_ways(floor, &tasks) },
+        is_grid: floor.site.source() == Source::Grid,
+        loaded_mm: if end.bodies.loaded_path_mm > 0 { carried_mm } else { sum_ways(floor, &tasks, begin.at_ms) },
+        begin,
+        end,
         tasks,
-        counts: records.counts(),
-        plans: plane.plan_log.plans(),
-        bodies,
-        no_progress: progress.no_progress(),
+        faults: config.scenario.faults,
         charging: config.scenario.charging,
         losses: (config.scenario.losses == Losses::Two).then(|| lost_robots.report()),
         verdicts,
-        reinstated: breakers.reinstated(),
         samples,
         planner_stop: config.scenario.planner_stop.clone(),
         wall: Duration::ZERO,
@@ -264,10 +292,11 @@ async fn explain_robots(plane: &ControlPlane, fleet: &Fleet) -> anyhow::Result<B
     Ok(verdicts)
 }
 
-/// The ways of tasks that were done, from the first goal of each to its last. Those to one goal stand beside each other, so
-/// that the way there is looked for once.
-fn sum_ways(floor: &Floor, tasks: &[TaskRecord]) -> u64 {
-    let mut done: Vec<&[WaypointIx]> = tasks.iter().filter(|t| t.done_ms.is_some()).map(|t| &*t.goals).collect();
+/// The ways of tasks that were done since, from the first goal of each to its last. Those to one goal stand beside each
+/// other, so that the way there is looked for once.
+fn sum_ways(floor: &Floor, tasks: &[TaskRecord], since_ms: u64) -> u64 {
+    let is_done = |task: &&TaskRecord| task.done_ms.is_some_and(|at| at >= since_ms);
+    let mut done: Vec<&[WaypointIx]> = tasks.iter().filter(is_done).map(|task| &*task.goals).collect();
     done.sort_by_key(|goals| goals.last().copied());
     done.into_iter().map(|goals| floor.way_mm(goals)).sum()
 }
