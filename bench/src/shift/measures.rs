@@ -7,15 +7,21 @@
 //!    its time so far: without it the longest would be left out.
 //! 3. What there is nothing to measure of is left out.
 
-use super::run::{Outcome, Sample};
+use super::run::Outcome;
 use super::scenario::{BATTERY_RATES, BodyFaults};
 use super::task_records::TaskRecord;
+use super::watches::Sample;
 use crate::figure::{Figure, median, percentile};
 use midshift_core::energy::{CAPACITY_MWH, IDLE_W};
 use midshift_core::site::grid;
 use midshift_core::task::spec::Class;
 use midshift_sim::body::Counts;
 use midshift_sim::faults::FAULT_BATTERY_EMPTY;
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+/// Name of the time that a run took.
+const RUN_BY_THE_WALL: &str = "run by the wall";
 
 /// One figure of one shift.
 #[derive(Clone, Debug)]
@@ -96,7 +102,7 @@ pub fn measures(outcome: &Outcome) -> Measures {
         told.add("plan by the wall, p50", "ms", percentile(&outcome.end.plans.plan_ms, 0.5));
         told.add("plan by the wall, p99", "ms", percentile(&outcome.end.plans.plan_ms, 0.99));
     }
-    told.add("run by the wall", "s", outcome.wall.as_secs_f64());
+    told.add(RUN_BY_THE_WALL, "s", outcome.wall.as_secs_f64());
     told
 }
 
@@ -151,7 +157,13 @@ fn add_robots(told: &mut Measures, outcome: &Outcome) {
         let driven_mm = outcome.end.bodies.path_mm - outcome.begin.bodies.path_mm;
         told.add("driving at the speed of a grid", "%", share(driven_mm * 1_000 / u64::from(grid::SPEED_MM_S)));
     }
-    let stood = |time: std::time::Duration| time.as_secs_f64() / 60.0;
+    if let (Some(begin), Some(end)) = (outcome.begin.gaps, outcome.end.gaps) {
+        let too_long = (end.named_too_long - begin.named_too_long) as f64;
+        told.add("named for a soon-free robot longer than 30 s", "tasks", too_long);
+        let idle_min = (end.idle_ms - begin.idle_ms) as f64 / 60_000.0;
+        told.add("idle > 5 s beside a task named for nobody", "robot-min", idle_min);
+    }
+    let stood = |time: Duration| time.as_secs_f64() / 60.0;
     let (begin, end) = (outcome.begin.no_progress, outcome.end.no_progress);
     told.add("no progress", "robot-min", stood(end.planned - begin.planned));
     if outcome.planner_stop.is_some() {
@@ -196,9 +208,7 @@ fn add_batteries(told: &mut Measures, outcome: &Outcome) {
         told.add("charging", "%", 100.0 * charging as f64 / (looks * outcome.robots) as f64);
         told.add("lowest charge", "%", f64::from(lowest) / 10.0);
     }
-    let ran_empty = |faults: &std::collections::BTreeMap<u32, u64>| {
-        faults.get(&FAULT_BATTERY_EMPTY).copied().unwrap_or_default() as f64
-    };
+    let ran_empty = |faults: &BTreeMap<u32, u64>| faults.get(&FAULT_BATTERY_EMPTY).copied().unwrap_or_default() as f64;
     let (begin, end) = (&outcome.begin.bodies.faults_by_code, &outcome.end.bodies.faults_by_code);
     told.add("batteries that ran empty", "1", ran_empty(end) - ran_empty(begin));
 }
@@ -240,18 +250,24 @@ pub fn backlog_figures(title: &str, seeds: &[Outcome]) -> Vec<Figure> {
 }
 
 /// Figures over the seeds of one policy and workload. A reference stands beside the tasks in an hour.
-pub fn figures(title: &str, seeds: &[Measures], reference_per_hour: Option<f64>) -> Vec<Figure> {
+pub fn figures(
+    title: &str,
+    seeds: &BTreeMap<u64, Measures>,
+    target_of_wall: &'static str,
+    reference_per_hour: Option<f64>,
+) -> Vec<Figure> {
     let mut names: Vec<(&str, &'static str)> = Vec::new();
-    for Measure { name, unit, .. } in seeds.iter().flat_map(|seed| &seed.0) {
+    for Measure { name, unit, .. } in seeds.values().flat_map(|seed| &seed.0) {
         if !names.iter().any(|(known, _)| known == name) {
             names.push((name, unit));
         }
     }
     let figure = |(name, unit): (&str, &'static str)| {
-        let values: Vec<f64> = seeds.iter().filter_map(|seed| seed.find(name)).collect();
+        let values: Vec<f64> = seeds.values().filter_map(|seed| seed.find(name)).collect();
         let reference = reference_per_hour.filter(|_| name == "tasks").map(|per_hour| [per_hour]);
         let limit = reference.as_ref().map(|values| ("the reference as given", values.as_slice()));
-        Figure::new("P7", format!("{title}: {name}"), unit, &values, limit)
+        let target = if name == RUN_BY_THE_WALL { target_of_wall } else { "P7" };
+        Figure::new(target, format!("{title}: {name}"), unit, &values, limit)
     };
     names.into_iter().map(figure).collect()
 }

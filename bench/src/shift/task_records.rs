@@ -180,6 +180,11 @@ impl TaskRecords {
         self.lock().busy.keys().cloned().collect()
     }
 
+    /// Tasks without a robot, and since when, milliseconds since the beginning.
+    pub fn waiting_tasks(&self) -> BTreeMap<TaskId, u64> {
+        self.lock().waiting.clone()
+    }
+
     /// Tasks that wait for a person.
     pub fn tasks_that_ask(&self) -> BTreeSet<TaskId> {
         self.lock().asking.clone()
