@@ -57,16 +57,21 @@ impl AssignmentWatch {
     /// The planner does not answer.
     pub async fn look(&mut self, plane: &ControlPlane, now_ms: u64) -> anyhow::Result<()> {
         let since_look_ms = now_ms - std::mem::replace(&mut self.looked_ms, now_ms);
+        if plane.is_planner_away() {
+            // Nobody names anything.
+            (self.named, self.idle) = Default::default();
+            return Ok(());
+        }
         let waiting = self.records.waiting_tasks();
         let busy = self.records.busy_robots();
         let robots = self.fleet.robots().iter().map(|robot| robot.robot_id());
         let idle = robots.filter(|robot_id| !busy.contains(*robot_id));
         self.idle = idle.map(|id| (id.clone(), self.idle.get(id).copied().unwrap_or(now_ms))).collect();
         let mut named = BTreeMap::new();
-        for task_id in waiting.keys() {
-            if is_named(&plane.explain_task(task_id).await?) {
-                named.insert(task_id.clone(), self.named.get(task_id).copied().unwrap_or(now_ms));
-            }
+        for explained in plane.explain_tasks(waiting.keys()).await?.iter().filter(|explained| is_named(explained)) {
+            let task_id = TaskId::parse(&explained.task_id)?;
+            let since = self.named.get(&task_id).copied().unwrap_or(now_ms);
+            named.insert(task_id, since);
         }
         self.named = named;
         let over = self.named.iter().filter(|(_, since)| now_ms - **since > NAMED_MAX_MS);

@@ -24,6 +24,7 @@ use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
 use midshift_task::TaskService;
 use midshift_telemetry::TelemetryService;
 use std::sync::Arc;
+use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
 /// Bytes of STATUS that are kept: nobody reads it.
@@ -204,14 +205,20 @@ impl ControlPlane {
         Ok(face.explain_robot(local(request)).await?.into_inner().explanation.unwrap_or_default())
     }
 
-    /// Why a task is where it is.
+    /// Why each of these tasks is where it is. All are asked at once, so that one turn of the planner answers many. One
+    /// that the planner does not know yet is left out.
     ///
     /// # Errors
-    /// There is no planner that could say so, or it does not know the task.
-    pub async fn explain_task(&self, task_id: &TaskId) -> anyhow::Result<TaskExplanation> {
+    /// There is no planner that could say so.
+    pub async fn explain_tasks(&self, task_ids: impl Iterator<Item = &TaskId>) -> anyhow::Result<Vec<TaskExplanation>> {
         let face = &self.planner.as_ref().context("the planner is away")?.face;
-        let request = ExplainTaskRequest { task_id: task_id.to_string() };
-        Ok(face.explain_task(local(request)).await?.into_inner().explanation.unwrap_or_default())
+        let mut asked = JoinSet::new();
+        for task_id in task_ids {
+            let (face, request) = (face.clone(), ExplainTaskRequest { task_id: task_id.to_string() });
+            asked.spawn(async move { face.explain_task(local(request)).await });
+        }
+        let answers = asked.join_all().await.into_iter().flatten();
+        Ok(answers.filter_map(|answer| answer.into_inner().explanation).collect())
     }
 
     /// Resolves with why, if a service fails: the shift is over then.

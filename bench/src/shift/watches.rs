@@ -1,5 +1,5 @@
-//! What is looked at in a shift every few seconds: tasks, batteries, robots that stand, idle, are lost or out of work, and
-//! whether the planner is to be away.
+//! What is looked at in a shift every few seconds: tasks, batteries, robots that stand, idle, are lost or out of work,
+//! and whether the planner is to be away.
 
 use super::assignment_gaps::{AssignmentGaps, AssignmentWatch};
 use super::breakers::BreakerWatch;
@@ -150,7 +150,7 @@ impl Watches {
                 self.breakers.look_at_robots(plane, now_ms).await?;
             }
         }
-        if let Some(assignments) = self.assignments.as_mut().filter(|_| !is_away) {
+        if let Some(assignments) = &mut self.assignments {
             assignments.look(plane, now_ms).await?;
         }
         if scenario.losses == Losses::Two {
