@@ -9,6 +9,7 @@ use crate::arguments::parse_time;
 use crate::figure::Figure;
 use anyhow::ensure;
 use clap::builder::RangedU64ValueParser;
+use midshift_core::limits;
 use midshift_proto::fleet::v1::{AssignmentPolicy, PlannerPolicy};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -79,6 +80,9 @@ pub struct ShiftArgs {
     /// Chargers of a grid in W5; without it 14 for 50 robots.
     #[arg(long)]
     chargers: Option<usize>,
+    /// State of charge of each robot at the beginning of W5, percent: alike, so that all are low together.
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u16).range(1..=100))]
+    charge_percent: u16,
     /// Half an hour and two seeds, for a look.
     #[arg(long, conflicts_with_all = ["hours", "seeds"])]
     quick: bool,
@@ -91,9 +95,10 @@ pub struct ShiftArgs {
     /// Milliseconds that each turn of the planner takes, after which it rests as long.
     #[arg(long, default_value_t = 0)]
     plan_ms: u64,
-    /// Milliseconds between two wakes of the planner with more than 100 robots; with fewer it plans at each event.
-    #[arg(long, default_value_t = 5_000)]
-    plan_pause_ms: u64,
+    /// Milliseconds that news wait with more than 100 robots before they wake the planner; with fewer it plans at each
+    /// event. It sweeps each 250 ms and plans then as well, so news never wait longer.
+    #[arg(long, default_value_t = SWEEP_MS, value_parser = clap::value_parser!(u64).range(..=SWEEP_MS))]
+    news_wait_ms: u64,
     /// Milliseconds between two heartbeats, at least 100; without it as the server says.
     #[arg(long, value_parser = clap::value_parser!(u64).range(100..))]
     heartbeat_ms: Option<u64>,
@@ -111,6 +116,8 @@ pub struct ShiftArgs {
     pub reference_per_hour: Option<f64>,
 }
 
+/// The planner sweeps so often, whatever it is told.
+const SWEEP_MS: u64 = limits::SWEEP.as_ms();
 /// The saturated rate is measured over at most so long.
 const SATURATED: Duration = Duration::from_secs(2 * 3_600);
 /// Robots for which a floor has so many chargers in the shift of batteries.
@@ -168,7 +175,7 @@ impl ShiftArgs {
     /// One shift.
     pub fn config(&self, floor: &Arc<Floor>, seed: u64, policy: Policy, scenario: Scenario) -> ShiftConfig {
         let robots = scenario.robots.unwrap_or(self.robots);
-        let pause = Duration::from_millis(self.plan_pause_ms);
+        let pause = Duration::from_millis(self.news_wait_ms);
         ShiftConfig {
             floor: floor.clone(),
             robots,
@@ -179,6 +186,7 @@ impl ShiftArgs {
                 pause: if robots > EVENT_DRIVEN_MAX { pause } else { Duration::ZERO },
             },
             heartbeat: self.heartbeat_ms.map(Duration::from_millis),
+            charge_permille: 10 * self.charge_percent,
             turns: !self.no_turns,
             answers: if self.no_operator { Answers::None } else { Answers::Given },
             planner: policy.rules(self.ageing_permille),

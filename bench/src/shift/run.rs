@@ -56,6 +56,8 @@ pub struct ShiftConfig {
     pub pace: PlannerPace,
     /// Pause between two heartbeats; none: as the server says.
     pub heartbeat: Option<Duration>,
+    /// State of charge of each robot at the beginning where batteries empty, permille.
+    pub charge_permille: u16,
     /// Turning on the spot takes a body time.
     pub turns: bool,
     /// A person answers tasks in NEEDS_OPERATOR.
@@ -88,8 +90,8 @@ pub struct Outcome {
     pub begin: Totals,
     /// Up to its end, which is that of the shift.
     pub end: Totals,
-    /// Driven with a load within the measured time; where nothing is carried, the ways that tasks asked for between their
-    /// goals which were done in it. Millimetres.
+    /// Driven with a load within the measured time, millimetres. Where nothing is carried: the ways between the goals of
+    /// the tasks that were done in it.
     pub loaded_mm: u64,
     /// Every task of the whole shift.
     pub tasks: Vec<TaskRecord>,
@@ -231,7 +233,7 @@ fn sum_ways(floor: &Floor, tasks: &[TaskRecord], since_ms: u64) -> u64 {
     done.into_iter().map(|goals| floor.way_mm(goals)).sum()
 }
 
-/// The bodies. Batteries empty only in the shift of batteries: no other floor has chargers for them.
+/// The bodies. Batteries empty only in the shift of batteries: others may have no chargers.
 fn open_fleet(config: &ShiftConfig, clock: &VirtualClock) -> anyhow::Result<Fleet> {
     let faults = match config.scenario.faults {
         BodyFaults::None => FaultRates::none(),
@@ -241,5 +243,8 @@ fn open_fleet(config: &ShiftConfig, clock: &VirtualClock) -> anyhow::Result<Flee
     let of_site = FleetConfig::new(config.floor.site.clone(), config.robots, config.seed);
     let drains = config.scenario.charging.is_some();
     let energy = if drains { BATTERY_RATES } else { EnergyScale::default() };
-    Ok(Fleet::open(&FleetConfig { faults, drains, energy, turns: config.turns, ..of_site }, &clock.now())?)
+    // One that is not full and never empties would go to a charger for its opportunity, and stand there.
+    let battery_permille = Some(if drains { config.charge_permille } else { 1_000 });
+    let of_shift = FleetConfig { faults, drains, battery_permille, energy, turns: config.turns, ..of_site };
+    Ok(Fleet::open(&of_shift, &clock.now())?)
 }
