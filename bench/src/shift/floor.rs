@@ -95,8 +95,8 @@ impl Floor {
         Self::open(site, text, FloorSource { tasks: None, ..source })
     }
 
-    /// Checks that so many robots break no rule of the map. Seats are counted where the fleet takes them: on a grid each
-    /// free cell that is no charger is one.
+    /// Checks that so many robots break no rule of the map. The fleet counts the seats when it takes them: on a grid
+    /// each free cell that is no charger is one.
     ///
     /// # Errors
     /// The rules that they break.

@@ -3,8 +3,8 @@
 //! Invariants:
 //! 1. Every figure is of the measured time, from the end of the warm-up to the end of the shift. Of the whole shift are
 //!    only the rules that may not be broken, the items that the store did not take, and the times by the wall.
-//! 2. Times of tasks are of those submitted within the measured time that did not fail. One that is not over counts with
-//!    its time so far: without it the longest would be left out.
+//! 2. Times of tasks are of those submitted within the measured time that did not fail. One that is not over counts
+//!    with its time so far: without it the longest would be left out.
 //! 3. What there is nothing to measure of is left out.
 
 use super::run::Outcome;

@@ -36,8 +36,8 @@ pub enum Workload {
     W7,
     /// As W2 with 1,000 and with 5,000 robots, however many are asked for.
     W8,
-    /// Steady at 110 % of the saturated rate for two hours at least, with faults of bodies, and a planner that stops for
-    /// ten minutes.
+    /// Steady at 110 % of the saturated rate for two hours at least, with faults of bodies, and a planner that stops
+    /// for ten minutes.
     W6,
 }
 
