@@ -253,7 +253,8 @@ fn a_shift_is_the_same_run_again_and_does_each_task_once() {
     for policy in ["fifo-nearest", "rolling"] {
         let figure = |name: &str| figures[&format!("{policy} {name}")];
         assert!(figure("W2: tasks") > 0.0 && figure("W6: tasks") > 0.0, "{figures:?}");
-        assert!(figure("W2: utilisation") > 95.0, "{figures:?}");
+        assert!(figure("W2: robots with a task") > 95.0, "{figures:?}");
+        assert!(figure("W2: not done at the end") > 0.0, "{figures:?}");
     }
     assert_rules_hold(&figures);
 }
@@ -264,37 +265,61 @@ fn robots_of_a_shift_keep_out_of_each_others_places() {
     let site = concat!(env!("CARGO_MANIFEST_DIR"), "/../sites/demo.site.toml");
     let (_, figures) = shift(dir.path(), &["--site", site, "--robots", "6", "--hours", "0.1", "--seeds", "1"]);
     assert!(figures["fifo-nearest W2: tasks"] > 0.0, "{figures:?}");
+    for policy in ["fifo-nearest", "rolling"] {
+        assert_eq!(figures[&format!("{policy} W2: exclusion violations")], 0.0, "{figures:?}");
+    }
     assert_rules_hold(&figures);
 }
 
 #[test]
 fn batteries_of_a_shift_empty_and_fill_by_two_rules() {
     let dir = tempfile::tempdir().expect("a directory");
-    let (_, figures) = shift(dir.path(), &["--robots", "4", "--hours", "1", "--seeds", "1", "--workload", "w5"]);
+    let sizes = ["--robots", "4", "--hours", "2", "--seeds", "1", "--workload", "w5", "--policy", "rolling"];
+    // Within two hours no full battery falls to where the simple rule charges.
+    let sizes = [&sizes[..], &["--charge-percent", "50"]].concat();
+    let (said, figures) = shift(dir.path(), &sizes);
+    assert_eq!(shift(dir.path(), &sizes).0, said, "the same seed, another run");
     for rule in ["W5", "W5 simple"] {
-        let figure = |name: &str| figures[&format!("fifo-nearest {rule}: {name}")];
-        assert!(figure("tasks") > 0.0, "{figures:?}");
-        assert!(figure("charge lost at work") > 0.01 && figure("batteries that ran empty") == 0.0, "{figures:?}");
+        let figure = |name: &str| figures[&format!("rolling {rule}: {name}")];
+        assert!(figure("tasks") > 0.0 && figure("charging") > 0.0, "{figures:?}");
+        assert!(figure("charge lost at work") > 0.01, "{figures:?}");
     }
-    // Within an hour no battery falls to where the simple rule charges.
-    assert!(figures["fifo-nearest W5: charging"] > 0.0 && figures["fifo-nearest W5 simple: charging"] == 0.0);
+    let lowest = |rule: &str| figures[&format!("rolling {rule}: lowest charge")];
+    assert!(lowest("W5 simple") < lowest("W5"), "the simple rule waits until it must: {figures:?}");
+    assert_eq!(figures["rolling W5: batteries that ran empty"], 0.0, "{figures:?}");
     assert_rules_hold(&figures);
 }
 
 #[test]
 fn robots_that_are_lost_in_a_passage_keep_it_until_a_person_has_looked() {
     let dir = tempfile::tempdir().expect("a directory");
-    let (_, figures) = shift(dir.path(), &["--robots", "8", "--hours", "0.7", "--seeds", "1", "--workload", "w7"]);
+    let sizes = ["--robots", "8", "--hours", "0.7", "--seeds", "1", "--workload", "w7"];
+    let (said, figures) = shift(dir.path(), &sizes);
+    assert_eq!(shift(dir.path(), &sizes).0, said, "the same seed, another run");
     let figure = |name: &str| figures[&format!("fifo-nearest W7: {name}")];
     assert_eq!(figure("robots lost inside"), 2.0, "{figures:?}");
-    let held_s = figure("held by a lost robot, longest");
-    assert!((600.0..700.0).contains(&held_s) && figure("places cleared by a person") > 0.0, "{figures:?}");
+    assert!(figure("held by a lost robot, longest") >= 600.0, "{figures:?}");
+    assert!(figure("places cleared by a person") > 0.0, "{figures:?}");
     assert_rules_hold(&figures);
 }
 
-/// No task and no step is done twice, no item is lost, and no place is ever too full.
+#[test]
+fn a_shift_that_cannot_be_is_named_and_the_others_are_told() {
+    let dir = tempfile::tempdir().expect("a directory");
+    let file = dir.path().join("shift.json");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_midshift-bench"));
+    command.args(["shift", "--robots", "4", "--hours", "0.1", "--seeds", "1", "--workload", "w5,w8,w2"]);
+    let output = command.arg("--json").arg(&file).output().expect("it starts");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success() && said.contains("not measured: W5: it says nothing in less than 2 h"), "{said}");
+    assert!(said.contains("W8 of 1,000, seed 1: site shift has seats for 102 robots"), "{said}");
+    let text = std::fs::read_to_string(file).expect("it wrote what it could measure");
+    assert!(text.contains("\"rolling W2: tasks, of fifo-nearest\""), "{text}");
+}
+
+/// No task and no step is done twice, and no item is lost.
 fn assert_rules_hold(figures: &std::collections::BTreeMap<String, f64>) {
-    for rule in ["tasks that ended twice", "steps done twice", "items lost", "exclusion violations"] {
+    for rule in ["tasks that ended twice", "steps done twice", "items lost"] {
         let told: Vec<_> = figures.iter().filter(|(name, _)| name.ends_with(rule)).collect();
         assert!(!told.is_empty() && told.iter().all(|(_, times)| **times == 0.0), "{rule}: {told:?}");
     }

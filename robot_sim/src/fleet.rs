@@ -77,6 +77,8 @@ pub struct FleetConfig {
     pub faults: FaultRates,
     /// Batteries empty by work.
     pub drains: bool,
+    /// State of charge of every robot when it is made, permille; none: 600..=1000, drawn for each.
+    pub battery_permille: Option<u16>,
     /// How fast they do, and how fast a charger fills them.
     pub energy: EnergyScale,
     /// Turning on the spot takes time.
@@ -104,6 +106,7 @@ impl FleetConfig {
             prefix: "rbt-".to_owned(),
             faults: FaultRates::default(),
             drains: true,
+            battery_permille: None,
             energy: EnergyScale::default(),
             turns: true,
             auto_stock: true,
@@ -200,10 +203,11 @@ impl Fleet {
         };
         for (index, start) in starts.into_iter().enumerate().filter(|(i, _)| part.contains(i)) {
             let robot_id = config.robot_id(index)?;
-            let FleetConfig { faults, drains, energy, turns, pace_permille, .. } = *config;
+            let FleetConfig { faults, drains, battery_permille, energy, turns, pace_permille, .. } = *config;
             let of_body = BodyConfig {
                 faults,
                 drains,
+                battery_permille,
                 energy,
                 turns,
                 pace_permille,

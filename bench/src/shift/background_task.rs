@@ -47,7 +47,7 @@ fn explain_end(name: &str, ended: Result<anyhow::Result<()>, JoinError>) -> anyh
 }
 
 /// What a panic said, as far as it said it in words.
-pub fn panic_message(error: JoinError) -> String {
+fn panic_message(error: JoinError) -> String {
     let Ok(panic) = error.try_into_panic() else { return "it was aborted".to_owned() };
     let words = panic.downcast_ref::<String>().cloned();
     words.or_else(|| panic.downcast_ref::<&str>().map(|text| (*text).to_owned())).unwrap_or_default()

@@ -23,7 +23,7 @@ pub struct Course {
 impl Course {
     /// From the shifts of all seeds.
     pub fn new(title: String, seeds: &[Outcome]) -> Self {
-        let lasted_ms = seeds.iter().map(|seed| seed.lasted_ms).min().unwrap_or_default();
+        let lasted_ms = seeds.iter().map(|seed| seed.end.at_ms).min().unwrap_or_default();
         let step_ms = STEP_MS.min(lasted_ms / 6).max(1);
         let steps: Vec<u64> = (0..lasted_ms / step_ms).map(|step| step * step_ms).collect();
         let done = |seed: &Outcome, from_ms: u64| {

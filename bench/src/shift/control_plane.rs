@@ -8,7 +8,7 @@ use super::plan_log::{PlanLog, PlannerPace};
 use super::task_records::TaskRecords;
 use anyhow::Context;
 use midshift_core::heartbeat::NewestHeartbeat;
-use midshift_core::ids::RobotId;
+use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::limits;
 use midshift_core::site::Site;
 use midshift_core::time::Clock;
@@ -16,14 +16,15 @@ use midshift_fleet::FleetService;
 use midshift_proto::access::local;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService as Face;
 use midshift_proto::fleet::v1::{
-    AreaPolicy, AssignmentPolicy, ClearPlaceRequest, Duty, ExplainRobotRequest, GetAreaPolicyRequest,
+    AreaPolicy, ClearPlaceRequest, Duty, ExplainRobotRequest, ExplainTaskRequest, GetAreaPolicyRequest,
     ListPlacesRequest, ListRobotControlsRequest, Place, PlannerPolicy, PutAreaPolicyRequest, PutPlannerRequest,
-    UncordonRobotRequest,
+    RobotExplanation, TaskExplanation, UncordonRobotRequest,
 };
 use midshift_store::{LiveBoard, MemoryFrames, MemoryStore, Store, StoreId};
 use midshift_task::TaskService;
 use midshift_telemetry::TelemetryService;
 use std::sync::Arc;
+use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
 /// Bytes of STATUS that are kept: nobody reads it.
@@ -171,10 +172,17 @@ impl ControlPlane {
     /// There is no planner that could say so.
     pub async fn list_broken_off(&self) -> anyhow::Result<Vec<String>> {
         let face = &self.planner.as_ref().context("the planner is away")?.face;
-        let request = ListRobotControlsRequest { page_size: limits::PAGE_MAX as u32, ..Default::default() };
-        let controls = face.list_robot_controls(local(request)).await?.into_inner().controls;
-        let broken_off = controls.into_iter().filter(|control| control.duty() == Duty::BrokenOff);
-        Ok(broken_off.map(|control| control.robot_id).collect())
+        let mut broken_off = Vec::new();
+        let mut request = ListRobotControlsRequest { page_size: limits::PAGE_MAX as u32, ..Default::default() };
+        loop {
+            let page = face.list_robot_controls(local(request.clone())).await?.into_inner();
+            let controls = page.controls.into_iter().filter(|control| control.duty() == Duty::BrokenOff);
+            broken_off.extend(controls.map(|control| control.robot_id));
+            if page.next_page_token.is_empty() {
+                return Ok(broken_off);
+            }
+            request.page_token = page.next_page_token;
+        }
     }
 
     /// Lets a robot work again, as the operator does who has looked at it.
@@ -187,17 +195,30 @@ impl ControlPlane {
         Ok(())
     }
 
-    /// Code of why a robot has no work, or of what it does; of one that could work, why the first waiting task is not
-    /// given to it. Empty: nothing stands against it.
+    /// Why a robot does what it does.
     ///
     /// # Errors
     /// There is no planner that could say so, or it does not know the robot.
-    pub async fn explain_robot(&self, robot_id: &RobotId) -> anyhow::Result<String> {
+    pub async fn explain_robot(&self, robot_id: &RobotId) -> anyhow::Result<RobotExplanation> {
         let face = &self.planner.as_ref().context("the planner is away")?.face;
         let request = ExplainRobotRequest { robot_id: robot_id.to_string() };
-        let explained = face.explain_robot(local(request)).await?.into_inner().explanation.unwrap_or_default();
-        let first = explained.candidates.into_iter().next().and_then(|candidate| candidate.reason);
-        Ok(explained.verdict.or(first).map(|reason| reason.code).unwrap_or_default())
+        Ok(face.explain_robot(local(request)).await?.into_inner().explanation.unwrap_or_default())
+    }
+
+    /// Why each of these tasks is where it is. All are asked at once, so that one turn of the planner answers many. One
+    /// that the planner does not know yet is left out.
+    ///
+    /// # Errors
+    /// There is no planner that could say so.
+    pub async fn explain_tasks(&self, task_ids: impl Iterator<Item = &TaskId>) -> anyhow::Result<Vec<TaskExplanation>> {
+        let face = &self.planner.as_ref().context("the planner is away")?.face;
+        let mut asked = JoinSet::new();
+        for task_id in task_ids {
+            let (face, request) = (face.clone(), ExplainTaskRequest { task_id: task_id.to_string() });
+            asked.spawn(async move { face.explain_task(local(request)).await });
+        }
+        let answers = asked.join_all().await.into_iter().flatten();
+        Ok(answers.filter_map(|answer| answer.into_inner().explanation).collect())
     }
 
     /// Resolves with why, if a service fails: the shift is over then.
@@ -218,10 +239,9 @@ impl ControlPlane {
     ///
     /// # Errors
     /// It is refused, or the planner is away.
-    pub async fn put_planner(&self, policy: AssignmentPolicy) -> anyhow::Result<()> {
+    pub async fn put_planner(&self, policy: PlannerPolicy) -> anyhow::Result<()> {
         let face = &self.planner.as_ref().context("the planner is away")?.face;
-        let policy = Some(PlannerPolicy { policy: Some(policy.into()), ..PlannerPolicy::default() });
-        face.put_planner(local(PutPlannerRequest { policy, ..PutPlannerRequest::default() })).await?;
+        face.put_planner(local(PutPlannerRequest { policy: Some(policy), ..PutPlannerRequest::default() })).await?;
         Ok(())
     }
 }

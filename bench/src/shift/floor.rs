@@ -3,7 +3,7 @@
 //! Maps and lists are read by their paths. Without any, a small grid is built in, and tasks are drawn between stations.
 
 use super::chargers::place_chargers;
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use midshift_cli::task_list::{read_list, request};
 use midshift_core::site::file::{self, Loaded};
 use midshift_core::site::route::Router;
@@ -50,9 +50,6 @@ pub struct FloorSource<'a> {
     pub form: TaskForm,
 }
 
-/// Seats that are counted of a site at most.
-const SEATS_MAX: usize = 10_000;
-
 /// A floor and its text.
 pub struct Floor {
     /// The site.
@@ -92,20 +89,24 @@ impl Floor {
     /// The built-in demo site, which has a door and an aisle for one. Nothing is listed there.
     ///
     /// # Errors
-    /// It has no room for a single robot.
+    /// It has no room for so many robots.
     pub fn demo(source: FloorSource) -> anyhow::Result<Self> {
-        let fits = |robots: usize| file::demo(Some(robots as u64)).ok();
-        let Loaded { site, text, .. } = (1..=source.robots).rev().find_map(fits).context("the demo has no room")?;
+        let Loaded { site, text, .. } = file::demo(Some(source.robots as u64))?;
         Self::open(site, text, FloorSource { tasks: None, ..source })
     }
 
-    /// Robots that it has room for: any number on a grid, where nothing is reserved.
-    pub fn seats(&self) -> usize {
-        if !self.site.collisions_modelled() {
-            return usize::MAX;
+    /// Checks that so many robots break no rule of the map. The fleet counts the seats when it takes them: on a grid
+    /// each free cell that is no charger is one.
+    ///
+    /// # Errors
+    /// The rules that they break.
+    pub fn check_room(&self, robots: usize) -> anyhow::Result<()> {
+        if self.site.collisions_modelled() {
+            let findings = lint::lint(&self.site, Some(robots as u64));
+            let words: Vec<&str> = findings.iter().map(|finding| finding.message.as_str()).collect();
+            ensure!(!lint::refuses(&findings), "no room for {robots} robots: {}", words.join("; "));
         }
-        let fits = |robots: &usize| !lint::refuses(&lint::lint(&self.site, Some(*robots as u64)));
-        (1..=self.site.starting_places(SEATS_MAX).len()).rev().find(fits).unwrap_or(0)
+        Ok(())
     }
 
     /// The same floor with so many chargers, if it is a grid; a site has its own.

@@ -13,9 +13,10 @@ use midshift_core::time::{SiteDuration, SiteTime};
 use midshift_proto::fleet::v1::Place;
 use midshift_sim::faults::Injected;
 use midshift_sim::fleet::Fleet;
+use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
@@ -34,21 +35,26 @@ pub struct LossReport {
     pub robots: usize,
     /// Places that a person cleared.
     pub cleared: u64,
-    /// Longest time that a place stayed held by a robot that was silent, milliseconds.
+    /// Longest time from the loss of a robot until a place that it held was free, or to the end of the shift; in
+    /// milliseconds.
     pub longest_hold_ms: u64,
-    /// Longest time that a passage did.
+    /// The same of passages.
     pub longest_passage_hold_ms: u64,
 }
 
 struct LostRobot {
     robot_id: RobotId,
     since: SiteTime,
+    /// Ids of the places that it held when it was lost and holds still, also once it is heard again. None: not asked
+    /// yet.
+    held: Option<BTreeSet<String>>,
 }
 
 /// The watch over robots that are lost.
 pub struct LostRobots {
     site: Arc<Site>,
     fleet: Arc<Fleet>,
+    rng: ChaCha8Rng,
     /// When the next ones are lost, the last first.
     due: Vec<SiteTime>,
     lost: Vec<LostRobot>,
@@ -63,7 +69,7 @@ impl LostRobots {
         let mut due: Vec<_> =
             LOST_PERMILLE.map(|range| SiteTime(lasts_ms * rng.random_range(range) / 1_000)).into_iter().collect();
         due.reverse();
-        Self { site, fleet, due, lost: Vec::new(), report: LossReport::default() }
+        Self { site, fleet, rng, due, lost: Vec::new(), report: LossReport::default() }
     }
 
     /// What came of it so far.
@@ -77,28 +83,32 @@ impl LostRobots {
     /// The planner does not answer.
     pub async fn look_at_robots(&mut self, plane: &ControlPlane, now: SiteTime) -> anyhow::Result<()> {
         if self.due.last().is_some_and(|due| *due <= now)
-            && let Some(robot_id) = self.find_inside()
+            && let Some(robot_id) = self.draw_inside()
         {
             self.fleet.inject(now, &robot_id, Injected::DropNetwork(SILENT_FOR));
-            self.lost.push(LostRobot { robot_id, since: now });
+            self.lost.push(LostRobot { robot_id, since: now, held: None });
             self.report.robots += 1;
             self.due.pop();
         }
-        self.lost.retain(|robot| now.since(robot.since) < SILENT_FOR);
+        let is_over = |held: &Option<BTreeSet<String>>| held.as_ref().is_some_and(BTreeSet::is_empty);
+        self.lost.retain(|robot| now.since(robot.since) < SILENT_FOR || !is_over(&robot.held));
         if self.lost.is_empty() {
             return Ok(());
         }
         let held = held_places(plane.list_held_places().await?);
-        for robot in &self.lost {
+        for robot in &mut self.lost {
             let places = held.get(robot.robot_id.as_str()).map_or(&[][..], Vec::as_slice);
             let held_ms = now.since(robot.since).as_ms();
-            for place in places {
+            let ids = || places.iter().map(|place| place.place_id.clone()).collect();
+            let kept = robot.held.get_or_insert_with(ids);
+            kept.retain(|place_id| places.iter().any(|place| place.place_id == *place_id));
+            for place in places.iter().filter(|place| kept.contains(&place.place_id)) {
                 self.report.longest_hold_ms = self.report.longest_hold_ms.max(held_ms);
                 if is_passage(&self.site, place) {
                     self.report.longest_passage_hold_ms = self.report.longest_passage_hold_ms.max(held_ms);
                 }
             }
-            if now.since(robot.since) >= PERSON_AFTER {
+            if (PERSON_AFTER..SILENT_FOR).contains(&now.since(robot.since)) {
                 let inside = self.fleet.robot(&robot.robot_id).map(|robot| robot.lock().inside().clone());
                 let inside = inside.unwrap_or_default();
                 for place in places.iter().filter(|place| !inside.iter().any(|id| id.as_str() == place.place_id)) {
@@ -110,8 +120,8 @@ impl LostRobots {
         Ok(())
     }
 
-    /// A robot inside a passage for one, that is not lost already.
-    fn find_inside(&self) -> Option<RobotId> {
+    /// One of the robots inside a passage for one that are not lost already.
+    fn draw_inside(&mut self) -> Option<RobotId> {
         let is_lost = |robot_id: &RobotId| self.lost.iter().any(|robot| robot.robot_id == *robot_id);
         let is_inside = |robot_id: &RobotId| {
             let inside = self.fleet.robot(robot_id).map(|robot| robot.lock().inside().clone()).unwrap_or_default();
@@ -119,7 +129,8 @@ impl LostRobots {
             places.map(|place| self.site.place(place)).any(|p| p.kind() == PlaceKind::Passage && p.capacity == 1)
         };
         let robots = self.fleet.robots().iter().map(|robot| robot.robot_id());
-        robots.filter(|robot_id| !is_lost(robot_id)).find(|robot_id| is_inside(robot_id)).cloned()
+        let all: Vec<&RobotId> = robots.filter(|robot_id| !is_lost(robot_id) && is_inside(robot_id)).collect();
+        all.choose(&mut self.rng).copied().cloned()
     }
 }
 

@@ -1,144 +1,273 @@
 //! What is told of a shift: rates, times and shares, from the records of its tasks and its bodies.
+//!
+//! Invariants:
+//! 1. Every figure is of the measured time, from the end of the warm-up to the end of the shift. Of the whole shift are
+//!    only the rules that may not be broken, the items that the store did not take, and the times by the wall.
+//! 2. Times of tasks are of those submitted within the measured time that did not fail. One that is not over counts
+//!    with its time so far: without it the longest would be left out.
+//! 3. What there is nothing to measure of is left out.
 
-use super::run::{Outcome, Sample};
-use super::scenario::BATTERY_RATES;
-use super::task_records::{TaskRecord, Urgency};
-use crate::figure::{Figure, percentile};
+use super::run::Outcome;
+use super::scenario::{BATTERY_RATES, BodyFaults};
+use super::task_records::TaskRecord;
+use super::watches::Sample;
+use crate::figure::{Figure, median, percentile};
 use midshift_core::energy::{CAPACITY_MWH, IDLE_W};
 use midshift_core::site::grid;
+use midshift_core::task::spec::Class;
+use midshift_sim::body::Counts;
 use midshift_sim::faults::FAULT_BATTERY_EMPTY;
-use std::ops::Range;
+use std::collections::BTreeMap;
 use std::time::Duration;
 
-/// What is told of one shift, each by its name and unit.
-pub type Measures = Vec<(&'static str, &'static str, f64)>;
+/// Name of the time that a run took.
+const RUN_BY_THE_WALL: &str = "run by the wall";
 
-/// A shift is measured after its first part, which fills the floor with work: a tenth of it, at most so long.
-const WARM_UP_MS: u64 = 600_000;
-
-/// From when on a shift of this length is measured, milliseconds.
-pub fn measured_from_ms(lasted_ms: u64) -> u64 {
-    (lasted_ms / 10).min(WARM_UP_MS)
+/// One figure of one shift.
+#[derive(Clone, Debug)]
+pub struct Measure {
+    /// What was measured.
+    pub name: String,
+    /// Unit of its value.
+    pub unit: &'static str,
+    /// What came out.
+    pub value: f64,
 }
 
-/// Tasks done in an hour of the part that is measured.
+/// All that is told of one shift.
+#[derive(Clone, Debug, Default)]
+pub struct Measures(Vec<Measure>);
+
+impl Measures {
+    /// The value under a name; none: there was nothing to measure.
+    pub fn find(&self, name: &str) -> Option<f64> {
+        self.0.iter().find(|measure| measure.name == name).map(|measure| measure.value)
+    }
+
+    fn add(&mut self, name: impl Into<String>, unit: &'static str, value: f64) {
+        self.0.push(Measure { name: name.into(), unit, value });
+    }
+
+    fn add_times(&mut self, what: &str, times_ms: &[u64]) {
+        if times_ms.is_empty() {
+            return;
+        }
+        let times: Vec<f64> = times_ms.iter().map(|ms| *ms as f64 / 1e3).collect();
+        self.add(format!("{what}, mean"), "s", times.iter().sum::<f64>() / times.len() as f64);
+        for (words, share) in [("p50", 0.5), ("p95", 0.95), ("longest", 1.0)] {
+            self.add(format!("{what}, {words}"), "s", percentile(&times, share));
+        }
+    }
+}
+
+/// Tasks done in an hour of the measured time.
 pub fn tasks_per_hour(outcome: &Outcome) -> f64 {
-    let from_ms = measured_from_ms(outcome.lasted_ms);
-    let done = outcome.tasks.iter().filter(|task| task.done_ms.is_some_and(|at| at >= from_ms)).count();
-    done as f64 * 3_600_000.0 / (outcome.lasted_ms - from_ms).max(1) as f64
+    let done = outcome.tasks.iter().filter(|task| task.done_ms.is_some_and(|at| at >= outcome.begin.at_ms)).count();
+    done as f64 * 3_600_000.0 / measured_ms(outcome) as f64
+}
+
+fn measured_ms(outcome: &Outcome) -> u64 {
+    (outcome.end.at_ms - outcome.begin.at_ms).max(1)
+}
+
+/// Samples of the measured time.
+fn samples(outcome: &Outcome) -> impl Iterator<Item = &Sample> {
+    outcome.samples.iter().filter(|sample| sample.at_ms > outcome.begin.at_ms)
+}
+
+/// What bodies counted within the measured time.
+fn counted(outcome: &Outcome, count: fn(&Counts) -> u64) -> u64 {
+    count(&outcome.end.bodies.counts) - count(&outcome.begin.bodies.counts)
 }
 
 /// Everything that is told of a shift.
 pub fn measures(outcome: &Outcome) -> Measures {
-    let from_ms = measured_from_ms(outcome.lasted_ms);
-    let told: Vec<&TaskRecord> = outcome.tasks.iter().filter(|task| task.submitted_ms >= from_ms).collect();
-    let seconds = |times: Vec<u64>| times.into_iter().map(|ms| ms as f64 / 1e3).collect::<Vec<f64>>();
-    let completion = seconds(told.iter().filter_map(|t| Some(t.done_ms? - t.submitted_ms)).collect());
-    // Of those that still wait, the time so far: without it the longest waits would be left out.
-    let waited = |t: &&TaskRecord| t.assigned_ms.unwrap_or(outcome.lasted_ms) - t.submitted_ms;
-    let waits = seconds(told.iter().map(waited).collect());
-    let urgent = told.iter().filter(|t| t.urgency == Urgency::Urgent).map(waited).collect();
-    let urgent_waits = seconds(urgent);
-    let bodies = &outcome.bodies;
-    let robots_ms = (outcome.robots as u64 * outcome.lasted_ms).max(1) as f64;
-    let share = |ms: u64| 100.0 * ms as f64 / robots_ms;
-    let assigned = outcome.tasks.iter().filter(|t| t.assignments > 0);
-    let (assigned, assignments) = assigned.fold((0_u64, 0_u64), |(n, sum), t| (n + 1, sum + u64::from(t.assignments)));
-    let mut measures = vec![
-        ("tasks", "1/h", tasks_per_hour(outcome)),
-        ("empty travel", "%", 100.0 * (1.0 - outcome.loaded_mm as f64 / bodies.path_mm.max(1) as f64)),
-        ("completion, p50", "s", percentile(&completion, 0.5)),
-        ("completion, p95", "s", percentile(&completion, 0.95)),
-        ("wait for a robot, p50", "s", percentile(&waits, 0.5)),
-        ("wait for a robot, p95", "s", percentile(&waits, 0.95)),
-        ("wait for a robot, longest", "s", percentile(&waits, 1.0)),
-        ("utilisation", "%", 100.0 - share(bodies.counts.idle_ms)),
-        ("driving", "%", share(bodies.counts.driving_ms)),
-        ("acting", "%", share(bodies.counts.acting_ms)),
-        ("standing with a task", "%", share(bodies.counts.halted_ms + bodies.counts.blocked_ms)),
-        ("driving at the speed of a grid", "%", share(bodies.path_mm * 1_000 / u64::from(grid::SPEED_MM_S))),
-        ("re-assignments a task", "1", assignments.saturating_sub(assigned) as f64 / assigned.max(1) as f64),
-        ("tasks that failed", "1", outcome.counts.failed as f64),
-        ("tasks that ended twice", "1", outcome.counts.ended_twice as f64),
-        ("steps done twice", "1", bodies.verdict.steps_done_twice as f64),
-        ("items lost", "1", f64::from(u8::from(!bodies.verdict.items_conserved()))),
-        ("exclusion violations", "1", bodies.verdict.exclusion_violations as f64),
-        ("no progress", "robot-min", outcome.no_progress.planned.as_secs_f64() / 60.0),
-        ("waiting for a person", "task-min", asking_ms(outcome) as f64 / 60_000.0),
-        ("waiting for a person at the end", "tasks", outcome.counts.asking as f64),
-        ("answers of a person", "1", outcome.counts.answers as f64),
-        ("robots let work again by a person", "1", outcome.reinstated as f64),
-        ("items of plans lost", "1", outcome.plans.items_lost as f64),
-        ("plan by the wall, p50", "ms", percentile(&outcome.plans.plan_ms, 0.5)),
-        ("plan by the wall, p99", "ms", percentile(&outcome.plans.plan_ms, 0.99)),
-        ("run by the wall", "s", outcome.wall.as_secs_f64()),
-    ];
-    if let Some(stop) = &outcome.planner_stop {
-        let unplanned = outcome.no_progress.unplanned.as_secs_f64() / 60.0;
-        measures.push(("no progress while the planner is away", "robot-min", unplanned));
-        measures.push(("backlog of the stop stays", "min", backlog_stays_ms(outcome, stop) as f64 / 60_000.0));
-    }
+    let mut told = Measures::default();
+    add_tasks(&mut told, outcome);
+    add_robots(&mut told, outcome);
+    add_people(&mut told, outcome);
+    add_rules(&mut told, outcome);
     if outcome.charging.is_some() {
-        measures.extend(battery_measures(outcome));
+        add_batteries(&mut told, outcome);
     }
     if let Some(losses) = &outcome.losses {
-        measures.push(("robots lost inside", "1", losses.robots as f64));
-        measures.push(("held by a lost robot, longest", "s", losses.longest_hold_ms as f64 / 1e3));
-        measures.push(("passage held by a lost robot, longest", "s", losses.longest_passage_hold_ms as f64 / 1e3));
-        measures.push(("places cleared by a person", "1", losses.cleared as f64));
+        told.add("robots lost inside", "1", losses.robots as f64);
+        told.add("places cleared by a person", "1", losses.cleared as f64);
+        if losses.robots > 0 {
+            told.add("held by a lost robot, longest", "s", losses.longest_hold_ms as f64 / 1e3);
+            told.add("passage held by a lost robot, longest", "s", losses.longest_passage_hold_ms as f64 / 1e3);
+        }
     }
-    if !urgent_waits.is_empty() {
-        measures.push(("urgent wait for a robot, p50", "s", percentile(&urgent_waits, 0.5)));
-        measures.push(("urgent wait for a robot, p95", "s", percentile(&urgent_waits, 0.95)));
+    if !outcome.end.plans.plan_ms.is_empty() {
+        told.add("plan by the wall, p50", "ms", percentile(&outcome.end.plans.plan_ms, 0.5));
+        told.add("plan by the wall, p99", "ms", percentile(&outcome.end.plans.plan_ms, 0.99));
     }
-    measures
+    told.add(RUN_BY_THE_WALL, "s", outcome.wall.as_secs_f64());
+    told
 }
 
-/// What is told of batteries.
-fn battery_measures(outcome: &Outcome) -> Measures {
-    let counts = &outcome.bodies.counts;
-    let busy_ms = counts.driving_ms + counts.acting_ms + counts.blocked_ms + counts.halted_ms;
+fn add_tasks(told: &mut Measures, outcome: &Outcome) {
+    told.add("tasks", "1/h", tasks_per_hour(outcome));
+    let driven_mm = outcome.end.bodies.path_mm - outcome.begin.bodies.path_mm;
+    if driven_mm > 0 {
+        told.add("empty travel", "%", 100.0 * (1.0 - outcome.loaded_mm as f64 / driven_mm as f64));
+    }
+    let (begins_ms, ends_ms) = (outcome.begin.at_ms, outcome.end.at_ms);
+    let submitted: Vec<&TaskRecord> = outcome.tasks.iter().filter(|task| task.submitted_ms >= begins_ms).collect();
+    let completion_ms = |task: &TaskRecord| task.done_ms.unwrap_or(ends_ms) - task.submitted_ms;
+    let wait_ms = |task: &TaskRecord| task.assigned_ms.unwrap_or(ends_ms) - task.submitted_ms;
+    let goes_on: Vec<&TaskRecord> = submitted.iter().copied().filter(|task| !task.has_failed()).collect();
+    let mut add_times = |of: &str, tasks: &[&TaskRecord]| {
+        told.add_times(&format!("{of}completion"), &tasks.iter().map(|t| completion_ms(t)).collect::<Vec<_>>());
+        told.add_times(&format!("{of}wait for a robot"), &tasks.iter().map(|t| wait_ms(t)).collect::<Vec<_>>());
+    };
+    add_times("", &goes_on);
+    for class in [Class::Urgent, Class::Normal, Class::Background] {
+        let of_class: Vec<&TaskRecord> = goes_on.iter().copied().filter(|task| task.class == class).collect();
+        if of_class.len() < goes_on.len() {
+            add_times(&format!("{} ", class.as_str()), &of_class);
+        }
+    }
+    let not_done = goes_on.iter().filter(|task| task.done_ms.is_none()).count();
+    told.add("not done at the end", "tasks", not_done as f64);
+    told.add("waiting at the end", "tasks", outcome.end.counts.waiting as f64);
+    told.add("tasks that failed", "tasks", (outcome.end.counts.failed - outcome.begin.counts.failed) as f64);
+    let assigned = submitted.iter().filter(|task| task.assigned_ms.is_some()).count();
+    if assigned > 0 {
+        let sum = |times: fn(&TaskRecord) -> u32| submitted.iter().map(|task| f64::from(times(task))).sum::<f64>();
+        told.add("re-assignments a task", "1", sum(|task| task.reassignments) / assigned as f64);
+        told.add("retries a task", "1", sum(|task| task.retries) / assigned as f64);
+    }
+}
+
+fn add_robots(told: &mut Measures, outcome: &Outcome) {
+    let looks = samples(outcome).count();
+    if looks > 0 {
+        let busy: usize = samples(outcome).map(|sample| sample.counts.busy).sum();
+        told.add("robots with a task", "%", 100.0 * busy as f64 / (looks * outcome.robots) as f64);
+    }
+    let robots_ms = (outcome.robots as u64 * measured_ms(outcome)) as f64;
+    let share = |ms: u64| 100.0 * ms as f64 / robots_ms;
+    // A robot that waits for a grant has a task and no order.
+    told.add("bodies with an order", "%", 100.0 - share(counted(outcome, |c| c.idle_ms)));
+    told.add("driving", "%", share(counted(outcome, |c| c.driving_ms)));
+    told.add("acting", "%", share(counted(outcome, |c| c.acting_ms)));
+    told.add("standing with an order", "%", share(counted(outcome, |c| c.halted_ms + c.blocked_ms)));
+    if outcome.is_grid {
+        let driven_mm = outcome.end.bodies.path_mm - outcome.begin.bodies.path_mm;
+        told.add("driving at the speed of a grid", "%", share(driven_mm * 1_000 / u64::from(grid::SPEED_MM_S)));
+    }
+    if let (Some(begin), Some(end)) = (outcome.begin.gaps, outcome.end.gaps) {
+        let too_long = (end.named_too_long - begin.named_too_long) as f64;
+        told.add("named for a soon-free robot longer than 30 s", "tasks", too_long);
+        let idle_min = (end.idle_ms - begin.idle_ms) as f64 / 60_000.0;
+        told.add("idle > 5 s beside a task named for nobody", "robot-min", idle_min);
+    }
+    let stood = |time: Duration| time.as_secs_f64() / 60.0;
+    let (begin, end) = (outcome.begin.no_progress, outcome.end.no_progress);
+    told.add("no progress", "robot-min", stood(end.planned - begin.planned));
+    if outcome.planner_stop.is_some() {
+        told.add("no progress while the planner is away", "robot-min", stood(end.unplanned - begin.unplanned));
+    }
+}
+
+fn add_people(told: &mut Measures, outcome: &Outcome) {
+    told.add("waiting for a person", "task-min", asking_ms(outcome) as f64 / 60_000.0);
+    told.add("waiting for a person at the end", "tasks", outcome.end.counts.asking as f64);
+    told.add("answers of a person", "1", (outcome.end.counts.answers - outcome.begin.counts.answers) as f64);
+    if outcome.faults != BodyFaults::None || outcome.charging.is_some() {
+        let reinstated = outcome.end.reinstated - outcome.begin.reinstated;
+        told.add("robots let work again by a person", "1", reinstated as f64);
+    }
+}
+
+/// What may never be, of the whole shift.
+fn add_rules(told: &mut Measures, outcome: &Outcome) {
+    let verdict = &outcome.end.bodies.verdict;
+    told.add("tasks that ended twice", "1", outcome.end.counts.ended_twice as f64);
+    told.add("steps done twice", "1", verdict.steps_done_twice as f64);
+    told.add("items lost", "1", f64::from(u8::from(!verdict.items_conserved())));
+    if outcome.end.bodies.collisions_modelled {
+        told.add("exclusion violations", "1", verdict.exclusion_violations as f64);
+    }
+    told.add("items of plans lost", "1", outcome.end.plans.items_lost as f64);
+}
+
+fn add_batteries(told: &mut Measures, outcome: &Outcome) {
+    let busy_ms = counted(outcome, |c| c.driving_ms + c.acting_ms + c.blocked_ms + c.halted_ms);
     let idle_w = IDLE_W * f64::from(BATTERY_RATES.draw_permille) / 1e3;
-    let busy_mwh = outcome.bodies.energy_mwh as f64 - idle_w * counts.idle_ms as f64 / 3_600.0;
-    let lost_a_second = 100.0 * busy_mwh / CAPACITY_MWH / (busy_ms as f64 / 1e3).max(1.0);
-    let at_chargers: usize = outcome.samples.iter().map(|sample| sample.batteries.charging).sum();
-    let lowest = outcome.samples.iter().map(|sample| sample.batteries.lowest_permille).min().unwrap_or_default();
-    let empty = outcome.bodies.faults_by_code.get(&FAULT_BATTERY_EMPTY).copied().unwrap_or_default();
-    let robots = (outcome.samples.len() * outcome.robots).max(1) as f64;
-    vec![
-        ("charge lost at work", "%/s", lost_a_second),
-        ("charging", "%", 100.0 * at_chargers as f64 / robots),
-        ("lowest charge", "%", f64::from(lowest) / 10.0),
-        ("batteries that ran empty", "1", empty as f64),
-        ("waiting at the end", "tasks", outcome.counts.waiting as f64),
-    ]
+    let spent_mwh = (outcome.end.bodies.energy_mwh - outcome.begin.bodies.energy_mwh) as f64;
+    let busy_mwh = spent_mwh - idle_w * counted(outcome, |c| c.idle_ms) as f64 / 3_600.0;
+    if busy_ms > 0 {
+        told.add("charge lost at work", "%/s", 100.0 * busy_mwh / CAPACITY_MWH / (busy_ms as f64 / 1e3));
+    }
+    let looks = samples(outcome).count();
+    if looks > 0 {
+        let charging: usize = samples(outcome).map(|sample| sample.batteries.charging).sum();
+        let lowest = samples(outcome).map(|sample| sample.batteries.lowest_permille).min().unwrap_or_default();
+        told.add("charging", "%", 100.0 * charging as f64 / (looks * outcome.robots) as f64);
+        told.add("lowest charge", "%", f64::from(lowest) / 10.0);
+    }
+    let ran_empty = |faults: &BTreeMap<u32, u64>| faults.get(&FAULT_BATTERY_EMPTY).copied().unwrap_or_default() as f64;
+    let (begin, end) = (&outcome.begin.bodies.faults_by_code, &outcome.end.bodies.faults_by_code);
+    told.add("batteries that ran empty", "1", ran_empty(end) - ran_empty(begin));
 }
 
 /// Time that tasks spent in NEEDS_OPERATOR, summed up.
 fn asking_ms(outcome: &Outcome) -> u64 {
-    let mut before_ms = 0;
+    let mut before_ms = outcome.begin.at_ms;
     let mut since = |sample: &Sample| sample.at_ms - std::mem::replace(&mut before_ms, sample.at_ms);
-    outcome.samples.iter().map(|sample| sample.counts.asking as u64 * since(sample)).sum()
+    samples(outcome).map(|sample| sample.counts.asking as u64 * since(sample)).sum()
 }
 
-/// How long after the planner's return more tasks are open than when it stopped; to the end of the shift if for ever.
-fn backlog_stays_ms(outcome: &Outcome, stop: &Range<Duration>) -> u64 {
+/// Before a stop of the planner, the backlog is the median of so long, milliseconds.
+const BACKLOG_BASE_MS: u64 = 300_000;
+
+/// How long after the planner's return no more tasks are open than before it stopped. None: more are until the end.
+fn backlog_stays_ms(outcome: &Outcome) -> Option<u64> {
+    let stop = outcome.planner_stop.as_ref()?;
     let (begins_ms, ends_ms) = (stop.start.as_millis() as u64, stop.end.as_millis() as u64);
-    let before = outcome.samples.iter().take_while(|sample| sample.at_ms <= begins_ms).last();
-    let open = before.map_or(0, |sample| sample.counts.open);
+    let before = begins_ms.saturating_sub(BACKLOG_BASE_MS)..begins_ms;
+    let before = outcome.samples.iter().filter(|sample| before.contains(&sample.at_ms));
+    let usual = median(&before.map(|sample| sample.counts.open as f64).collect::<Vec<_>>());
     let mut after = outcome.samples.iter().filter(|sample| sample.at_ms >= ends_ms);
-    let gone = after.find(|sample| sample.counts.open <= open);
-    gone.map_or(outcome.lasted_ms, |sample| sample.at_ms).saturating_sub(ends_ms)
+    let gone = after.find(|sample| sample.counts.open as f64 <= usual);
+    gone.map(|sample| sample.at_ms - ends_ms)
+}
+
+/// What became of the backlog of a stop of the planner, over the seeds of one policy.
+pub fn backlog_figures(title: &str, seeds: &[Outcome]) -> Vec<Figure> {
+    let Some(stop) = seeds.first().and_then(|seed| seed.planner_stop.clone()) else { return Vec::new() };
+    let what = format!("{title}: backlog of a stop of {} min", (stop.end - stop.start).as_secs() / 60);
+    let gone: Vec<f64> = seeds.iter().filter_map(backlog_stays_ms).map(|stays_ms| stays_ms as f64 / 60_000.0).collect();
+    let never = (seeds.len() - gone.len()) as f64;
+    let name = format!("{what} not gone at the end, runs of {}", seeds.len());
+    let mut figures = vec![Figure::new("P7", name, "runs", &[never], None)];
+    if !gone.is_empty() {
+        figures.push(Figure::new("P7", format!("{what} is gone after"), "min", &gone, None));
+    }
+    figures
 }
 
 /// Figures over the seeds of one policy and workload. A reference stands beside the tasks in an hour.
-pub fn figures(title: &str, seeds: &[Measures], reference_per_hour: Option<f64>) -> Vec<Figure> {
-    let Some(first) = seeds.first() else { return Vec::new() };
-    let figure = |(nth, (name, unit, _)): (usize, &(&str, &'static str, f64))| {
-        let values: Vec<f64> = seeds.iter().filter_map(|seed| Some(seed.get(nth)?.2)).collect();
-        let reference = reference_per_hour.filter(|_| *name == "tasks").map(|per_hour| [per_hour]);
+pub fn figures(
+    title: &str,
+    seeds: &BTreeMap<u64, Measures>,
+    target_of_wall: &'static str,
+    reference_per_hour: Option<f64>,
+) -> Vec<Figure> {
+    let mut names: Vec<(&str, &'static str)> = Vec::new();
+    for Measure { name, unit, .. } in seeds.values().flat_map(|seed| &seed.0) {
+        if !names.iter().any(|(known, _)| known == name) {
+            names.push((name, unit));
+        }
+    }
+    let figure = |(name, unit): (&str, &'static str)| {
+        let values: Vec<f64> = seeds.values().filter_map(|seed| seed.find(name)).collect();
+        let reference = reference_per_hour.filter(|_| name == "tasks").map(|per_hour| [per_hour]);
         let limit = reference.as_ref().map(|values| ("the reference as given", values.as_slice()));
-        Figure::new("P7", format!("{title}: {name}"), unit, &values, limit)
+        let target = if name == RUN_BY_THE_WALL { target_of_wall } else { "P7" };
+        Figure::new(target, format!("{title}: {name}"), unit, &values, limit)
     };
-    first.iter().enumerate().map(figure).collect()
+    names.into_iter().map(figure).collect()
 }

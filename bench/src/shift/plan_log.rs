@@ -55,12 +55,13 @@ pub struct PlanLog {
     noted: Mutex<Noted>,
 }
 
-/// How often the planner has its turn, in virtual time. It always has one in each of its sweeps.
+/// How often the planner has its turn, in virtual time. It has one in each of its sweeps, whatever stands here.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct PlannerPace {
     /// Each turn takes so long, and the planner rests as long after it, so that news gather.
     pub turn: Duration,
-    /// Between two sweeps it is told that something was written at most once in so long; zero: at once.
+    /// It is told at most once in so long that something was written; zero: at once. Longer than a sweep changes
+    /// nothing.
     pub pause: Duration,
 }
 

@@ -2,32 +2,30 @@
 //!
 //! Invariant: one thread, one time, one seed; nothing reads the wall but what measures it.
 
-use super::background_task::panic_message;
-use super::breakers::BreakerWatch;
 use super::clock::VirtualClock;
 use super::control_plane::ControlPlane;
 use super::floor::Floor;
-use super::lost_robots::{LossReport, LostRobots};
+use super::lost_robots::LossReport;
 use super::operator::Operator;
-use super::plan_log::{PlannerPace, PlansNoted};
-use super::progress::{NoProgress, Planning, ProgressWatch};
+use super::plan_log::PlannerPace;
 use super::robot::{Robot, RobotConfig};
-use super::scenario::{BATTERY_RATES, BodyFaults, ChargingRule, Losses, Scenario};
-use super::task_records::{TaskCounts, TaskRecord, TaskRecords};
+use super::scenario::{BATTERY_RATES, BodyFaults, ChargingRule, Scenario};
+use super::task_records::{TaskRecord, TaskRecords};
+use super::watches::{Answers, Sample, Totals, WatchConfig, Watched, Watches};
 use super::workload::Client;
-use anyhow::bail;
-use midshift_agent::body::Body as _;
-use midshift_core::ids::TaskId;
-use midshift_core::site::WaypointIx;
-use midshift_core::time::{Clock, SiteTime};
-use midshift_proto::fleet::v1::AssignmentPolicy;
+use anyhow::{Context as _, anyhow, bail};
+use midshift_core::site::{Source, WaypointIx};
+use midshift_core::time::Clock;
+use midshift_proto::fleet::v1::PlannerPolicy;
 use midshift_sim::energy::EnergyScale;
 use midshift_sim::faults::FaultRates;
-use midshift_sim::fleet::{Fleet, FleetConfig, FleetReport};
+use midshift_sim::fleet::{Fleet, FleetConfig};
 use std::collections::BTreeMap;
 use std::ops::Range;
+use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use tokio::runtime::{RngSeed, UnhandledPanic};
 use tokio::task::JoinSet;
 
 /// The fleet is looked at this often, and the person who looks after broken robots goes round.
@@ -40,8 +38,8 @@ const WORK_BEGINS: Duration = Duration::from_secs(3);
 /// Obstacles in a kilometre where bodies are delayed.
 const DELAYS_PER_KM: f64 = 4.0 * 0.5;
 
-/// Robots that are asked at the end what they do, at most.
-const EXPLAINED_MAX: usize = 100;
+/// Robots up to which the planner is woken by each event, and asked what it does.
+pub const EVENT_DRIVEN_MAX: usize = 100;
 
 /// What one shift is.
 #[derive(Clone)]
@@ -50,8 +48,6 @@ pub struct ShiftConfig {
     pub floor: Arc<Floor>,
     /// How many robots.
     pub robots: usize,
-    /// How long it lasts.
-    pub lasts: Duration,
     /// Decides all that is drawn.
     pub seed: u64,
     /// Time that a message takes between a robot and the server, each way.
@@ -60,50 +56,27 @@ pub struct ShiftConfig {
     pub pace: PlannerPace,
     /// Pause between two heartbeats; none: as the server says.
     pub heartbeat: Option<Duration>,
+    /// State of charge of each robot at the beginning where batteries empty, permille.
+    pub charge_permille: u16,
     /// Turning on the spot takes a body time.
     pub turns: bool,
     /// A person answers tasks in NEEDS_OPERATOR.
     pub answers: Answers,
     /// How robots are chosen.
-    pub policy: AssignmentPolicy,
-    /// What is asked for, and what goes wrong.
+    pub planner: PlannerPolicy,
+    /// What is asked for, how long, and what goes wrong.
     pub scenario: Scenario,
 }
 
-/// Whether a person is at the screen.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Answers {
-    /// Tasks in NEEDS_OPERATOR stay there.
-    None,
-    /// They are answered after some minutes.
-    Given,
-}
-
-/// The fleet at one moment.
-#[derive(Clone, Copy, Debug)]
-pub struct Sample {
-    /// Since the beginning, milliseconds.
-    pub at_ms: u64,
-    /// Tasks at that moment.
-    pub counts: TaskCounts,
-    /// Batteries at that moment.
-    pub batteries: Batteries,
-}
-
-/// The batteries of a fleet at one moment.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Batteries {
-    /// The lowest of all, permille.
-    pub lowest_permille: u16,
-    /// Robots into whose battery energy flows.
-    pub charging: usize,
-}
-
-impl Batteries {
-    fn read(fleet: &Fleet, now: SiteTime) -> Self {
-        let states: Vec<_> = fleet.robots().iter().map(|robot| robot.state(now)).collect();
-        let lowest_permille = states.iter().map(|state| state.battery_permille).min().unwrap_or_default();
-        Self { lowest_permille, charging: states.iter().filter(|state| state.charging).count() }
+impl ShiftConfig {
+    fn watched(&self) -> WatchConfig {
+        WatchConfig {
+            site: self.floor.site.clone(),
+            scenario: self.scenario.clone(),
+            seed: self.seed,
+            answers: self.answers,
+            asks_planner: self.robots <= EVENT_DRIVEN_MAX && self.pace.turn.is_zero(),
+        }
     }
 }
 
@@ -111,29 +84,26 @@ impl Batteries {
 pub struct Outcome {
     /// Robots that there were.
     pub robots: usize,
-    /// How long it lasted, milliseconds.
-    pub lasted_ms: u64,
-    /// Driven with a load; where nothing is carried, the ways that tasks asked for between their goals. Millimetres.
+    /// The floor is a grid.
+    pub is_grid: bool,
+    /// Up to the beginning of the measured time.
+    pub begin: Totals,
+    /// Up to its end, which is that of the shift.
+    pub end: Totals,
+    /// Driven with a load within the measured time, millimetres. Where nothing is carried: the ways between the goals of
+    /// the tasks that were done in it.
     pub loaded_mm: u64,
-    /// Every task.
+    /// Every task of the whole shift.
     pub tasks: Vec<TaskRecord>,
-    /// Tasks at the end.
-    pub counts: TaskCounts,
-    /// What was planned.
-    pub plans: PlansNoted,
-    /// What the bodies did, and whether they broke a rule.
-    pub bodies: FleetReport,
-    /// Robots with a task that came on with nothing.
-    pub no_progress: NoProgress,
+    /// Whether bodies failed.
+    pub faults: BodyFaults,
     /// When robots charged; none: batteries did not empty.
     pub charging: Option<ChargingRule>,
     /// Of robots that were lost; none: none were to be.
     pub losses: Option<LossReport>,
     /// Robots at the end by the code of what they do, or of why they do nothing. Empty: too many to ask.
     pub verdicts: BTreeMap<String, usize>,
-    /// Robots that a person let work again after their breaker had opened.
-    pub reinstated: u64,
-    /// The fleet over time.
+    /// The fleet over the whole shift.
     pub samples: Vec<Sample>,
     /// When the planner was away.
     pub planner_stop: Option<Range<Duration>>,
@@ -159,10 +129,17 @@ impl Outcome {
 /// that fails.
 pub fn run(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     let begun = wall();
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build()?;
-    let outcome = runtime.block_on(play(config))?;
+    config.floor.check_room(config.robots)?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_time()
+        .start_paused(true)
+        .rng_seed(RngSeed::from_bytes(&config.seed.to_le_bytes()))
+        .unhandled_panic(UnhandledPanic::ShutdownRuntime)
+        .build()?;
+    let played = std::panic::catch_unwind(AssertUnwindSafe(|| runtime.block_on(play(config))));
     // Robots and services run for ever: they are dropped where they are.
     runtime.shutdown_background();
+    let outcome = played.map_err(|_| anyhow!("a task of it panicked, as is said above"))??;
     Ok(Outcome { wall: begun.elapsed(), ..outcome })
 }
 
@@ -175,7 +152,7 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
     let (floor, clock, records) = (&config.floor, VirtualClock::begin(), Arc::new(TaskRecords::default()));
     let mut plane =
         ControlPlane::open(floor.site.clone(), floor.text.clone(), clock.clone(), records.clone(), config.pace).await?;
-    plane.put_planner(config.policy).await?;
+    plane.put_planner(config.planner.clone()).await?;
     let fleet = Arc::new(open_fleet(config, &clock)?);
     let mut robots = JoinSet::new();
     for (number, body) in (0..).zip(fleet.robots()) {
@@ -199,56 +176,35 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
         }
     };
     tokio::pin!(answering);
-    let mut progress = ProgressWatch::new(fleet.clone(), records.clone());
-    let mut lost_robots = LostRobots::new(floor.site.clone(), fleet.clone(), config.lasts, config.seed);
-    let (mut breakers, mut samples) = (BreakerWatch::new(config.seed), Vec::new());
-    let lasts_ms = config.lasts.as_millis() as u64;
-    while clock.elapsed_ms() < lasts_ms {
+    let mut watches = Watches::new(config.watched(), fleet.clone(), records.clone(), clock.clone());
+    while clock.elapsed_ms() < config.scenario.lasts.as_millis() as u64 {
         tokio::select! {
             biased;
             ended = &mut asking => ended?,
             ended = &mut answering => ended?,
             failed = plane.await_failure() => return Err(failed),
-            Some(ended) = robots.join_next() => {
-                bail!("a robot ended: {}", ended.err().map_or_else(|| "by itself".to_owned(), panic_message));
-            }
-            () = tokio::time::sleep(LOOK) => {
-                let now = clock.now().site;
-                let batteries = config.scenario.charging.map(|_| Batteries::read(&fleet, now)).unwrap_or_default();
-                samples.push(Sample { at_ms: clock.elapsed_ms(), counts: records.counts(), batteries });
-                let is_away = plane.is_planner_away();
-                progress.look_at_robots(now, if is_away { Planning::Stopped } else { Planning::Goes });
-                if config.scenario.faults != BodyFaults::None {
-                    fleet.person_round(now, &|task_id: &TaskId| records.is_worked_on(task_id));
-                }
-                if config.scenario.faults != BodyFaults::None && config.answers == Answers::Given {
-                    breakers.look_at_robots(&plane, clock.elapsed_ms()).await?;
-                }
-                if config.scenario.losses == Losses::Two {
-                    lost_robots.look_at_robots(&plane, now).await?;
-                }
-                if let Some(stop) = &config.scenario.planner_stop {
-                    let is_away = stop.contains(&Duration::from_millis(clock.elapsed_ms()));
-                    if is_away { plane.stop_planner().await? } else { plane.start_planner() }
-                }
-            }
+            Some(_) = robots.join_next() => bail!("a robot ended by itself"),
+            () = tokio::time::sleep(LOOK) => watches.look(&mut plane).await?,
         }
     }
-    let verdicts = if config.robots <= EXPLAINED_MAX { explain_robots(&plane, &fleet).await? } else { BTreeMap::new() };
-    let (tasks, bodies) = (records.tasks(), fleet.report(clock.now().site)?);
+    // Before anything is explained: a question is a turn of the planner.
+    let (tasks, end) = (records.tasks(), watches.read_totals(&plane)?);
+    let Watched { begin, samples, losses } = watches.end();
+    let begin = begin.context("the shift ended before anything was measured")?;
+    let verdicts =
+        if config.robots <= EVENT_DRIVEN_MAX { explain_robots(&plane, &fleet).await? } else { BTreeMap::new() };
+    let carried_mm = end.bodies.loaded_path_mm - begin.bodies.loaded_path_mm;
     Ok(Outcome {
         robots: config.robots,
-        lasted_ms: clock.elapsed_ms(),
-        loaded_mm: if bodies.loaded_path_mm > 0 { bodies.loaded_path_mm } else { sum_ways(floor, &tasks) },
+        is_grid: floor.site.source() == Source::Grid,
+        loaded_mm: if end.bodies.loaded_path_mm > 0 { carried_mm } else { sum_ways(floor, &tasks, begin.at_ms) },
+        begin,
+        end,
         tasks,
-        counts: records.counts(),
-        plans: plane.plan_log.plans(),
-        bodies,
-        no_progress: progress.no_progress(),
+        faults: config.scenario.faults,
         charging: config.scenario.charging,
-        losses: (config.scenario.losses == Losses::Two).then(|| lost_robots.report()),
+        losses,
         verdicts,
-        reinstated: breakers.reinstated(),
         samples,
         planner_stop: config.scenario.planner_stop.clone(),
         wall: Duration::ZERO,
@@ -259,20 +215,25 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
 async fn explain_robots(plane: &ControlPlane, fleet: &Fleet) -> anyhow::Result<BTreeMap<String, usize>> {
     let mut verdicts = BTreeMap::new();
     for robot in fleet.robots().iter().filter(|_| !plane.is_planner_away()) {
-        *verdicts.entry(plane.explain_robot(robot.robot_id()).await?).or_default() += 1;
+        let explained = plane.explain_robot(robot.robot_id()).await?;
+        // Of one that could work, why the first waiting task is not given to it.
+        let first = explained.candidates.into_iter().next().and_then(|candidate| candidate.reason);
+        let code = explained.verdict.or(first).map(|reason| reason.code).unwrap_or_default();
+        *verdicts.entry(code).or_default() += 1;
     }
     Ok(verdicts)
 }
 
-/// The ways of tasks that were done, from the first goal of each to its last. Those to one goal stand beside each other, so
-/// that the way there is looked for once.
-fn sum_ways(floor: &Floor, tasks: &[TaskRecord]) -> u64 {
-    let mut done: Vec<&[WaypointIx]> = tasks.iter().filter(|t| t.done_ms.is_some()).map(|t| &*t.goals).collect();
+/// The ways of tasks that were done since, from the first goal of each to its last. Those to one goal stand beside each
+/// other, so that the way there is looked for once.
+fn sum_ways(floor: &Floor, tasks: &[TaskRecord], since_ms: u64) -> u64 {
+    let is_done = |task: &&TaskRecord| task.done_ms.is_some_and(|at| at >= since_ms);
+    let mut done: Vec<&[WaypointIx]> = tasks.iter().filter(is_done).map(|task| &*task.goals).collect();
     done.sort_by_key(|goals| goals.last().copied());
     done.into_iter().map(|goals| floor.way_mm(goals)).sum()
 }
 
-/// The bodies. Batteries empty only in the shift of batteries: no other floor has chargers for them.
+/// The bodies. Batteries empty only in the shift of batteries: others may have no chargers.
 fn open_fleet(config: &ShiftConfig, clock: &VirtualClock) -> anyhow::Result<Fleet> {
     let faults = match config.scenario.faults {
         BodyFaults::None => FaultRates::none(),
@@ -282,5 +243,8 @@ fn open_fleet(config: &ShiftConfig, clock: &VirtualClock) -> anyhow::Result<Flee
     let of_site = FleetConfig::new(config.floor.site.clone(), config.robots, config.seed);
     let drains = config.scenario.charging.is_some();
     let energy = if drains { BATTERY_RATES } else { EnergyScale::default() };
-    Ok(Fleet::open(&FleetConfig { faults, drains, energy, turns: config.turns, ..of_site }, &clock.now())?)
+    // One that is not full and never empties would go to a charger for its opportunity, and stand there.
+    let battery_permille = Some(if drains { config.charge_permille } else { 1_000 });
+    let of_shift = FleetConfig { faults, drains, battery_permille, energy, turns: config.turns, ..of_site };
+    Ok(Fleet::open(&of_shift, &clock.now())?)
 }

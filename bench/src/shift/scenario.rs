@@ -10,6 +10,8 @@ use std::time::Duration;
 const WAVE: (usize, Duration) = (40, Duration::from_secs(60));
 /// The planner is away for so long in the workload where it stops.
 const PLANNER_STOP: Duration = Duration::from_secs(600);
+/// That workload lasts so long at least: a backlog has an hour to go then.
+const W6_MIN: Duration = Duration::from_secs(2 * 3_600);
 
 /// Tasks an hour of one robot in the shift of batteries: 1,700 for fifty.
 const BATTERY_LOAD: f64 = 34.0;
@@ -32,10 +34,10 @@ pub enum Workload {
     W5,
     /// Saturated, on a site with a door and an aisle for one: bodies are delayed, and two of them fall silent inside.
     W7,
-    /// As W2 with 1,000 and with 5,000 robots, however many are asked for: a grid has room.
+    /// As W2 with 1,000 and with 5,000 robots, however many are asked for.
     W8,
-    /// Steady at 110 % of the saturated rate, with faults of bodies, and a planner that stops for ten minutes, or for a
-    /// twelfth of a shift of less than two hours.
+    /// Steady at 110 % of the saturated rate for two hours at least, with faults of bodies, and a planner that stops
+    /// for ten minutes.
     W6,
 }
 
@@ -53,6 +55,8 @@ pub struct Load {
 pub struct Scenario {
     /// Its name in figures.
     pub name: &'static str,
+    /// How long it lasts.
+    pub lasts: Duration,
     /// Robots that work; none: as many as were asked for.
     pub robots: Option<usize>,
     /// What is asked for.
@@ -118,6 +122,7 @@ impl Workload {
         let steady = |share: f64| Arrivals::Steady { per_hour: share * load.saturated_per_hour };
         let scenario = |name, arrivals| Scenario {
             name,
+            lasts,
             robots: None,
             demand: Demand { arrivals, urgent_permille: 0 },
             faults: BodyFaults::None,
@@ -147,9 +152,9 @@ impl Workload {
                 vec![Scenario { losses: Losses::Two, ..delayed }]
             }
             Self::W6 => {
-                let begins = lasts / 3;
-                let planner_stop = Some(begins..begins + PLANNER_STOP.min(lasts / 12));
-                vec![Scenario { faults: BodyFaults::Usual, planner_stop, ..scenario("W6", steady(1.1)) }]
+                let lasts = lasts.max(W6_MIN);
+                let planner_stop = Some(lasts / 3..lasts / 3 + PLANNER_STOP);
+                vec![Scenario { lasts, faults: BodyFaults::Usual, planner_stop, ..scenario("W6", steady(1.1)) }]
             }
         }
     }
@@ -157,6 +162,11 @@ impl Workload {
     /// Seeds that it is run with at most: a thousand robots take long.
     pub fn seeds_max(self) -> usize {
         if self == Self::W8 { 1 } else { usize::MAX }
+    }
+
+    /// Target of the design that its time by the wall answers.
+    pub fn target_of_wall(self) -> &'static str {
+        if self == Self::W8 { "P11" } else { "P7" }
     }
 
     /// Whether its load depends on the saturated rate.

@@ -4,24 +4,16 @@ use midshift_core::ids::{RobotId, TaskId};
 use midshift_core::site::WaypointIx;
 use midshift_core::task::TaskState;
 use midshift_core::task::machine::Phase;
+use midshift_core::task::spec::Class;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use tokio::sync::Notify;
 
-/// How urgent a task is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Urgency {
-    /// As most of the work.
-    Normal,
-    /// Before all others.
-    Urgent,
-}
-
 /// One task. Times are milliseconds since the beginning of the shift.
 #[derive(Clone, Debug)]
 pub struct TaskRecord {
-    /// How urgent it is.
-    pub urgency: Urgency,
+    /// Class of its priority.
+    pub class: Class,
     /// Where it leads, in order.
     pub goals: Vec<WaypointIx>,
     /// When it was submitted.
@@ -30,14 +22,25 @@ pub struct TaskRecord {
     pub assigned_ms: Option<u64>,
     /// When it was done.
     pub done_ms: Option<u64>,
-    /// Robots that were named for it, one after the other.
-    pub assignments: u32,
+    /// Times that it was given to a robot again although none had failed at it.
+    pub reassignments: u32,
+    /// Times that it was given to a robot again because an attempt had failed.
+    pub retries: u32,
     /// Where it is.
     pub phase: Phase,
     /// Code of why it is there; none: there is nothing to say.
     pub reason: Option<&'static str>,
     epoch: u64,
+    /// Failed attempts when it was assigned last.
+    failures: u32,
     robot_id: Option<RobotId>,
+}
+
+impl TaskRecord {
+    /// Whether it ended in another way than done.
+    pub fn has_failed(&self) -> bool {
+        self.phase.is_terminal() && self.done_ms.is_none()
+    }
 }
 
 #[derive(Default)]
@@ -49,7 +52,8 @@ struct Records {
     asking: BTreeSet<TaskId>,
     /// Tasks that a person has answered.
     answers: u64,
-    waiting: usize,
+    /// Tasks without a robot, and since when, milliseconds since the beginning.
+    waiting: BTreeMap<TaskId, u64>,
     open: usize,
     /// Ended in another way than done.
     failed: u64,
@@ -71,6 +75,8 @@ pub struct TaskCounts {
     pub waiting: usize,
     /// Not ended.
     pub open: usize,
+    /// Robots that have a task.
+    pub busy: usize,
     /// In NEEDS_OPERATOR.
     pub asking: usize,
     /// Answers that a person gave so far.
@@ -87,22 +93,24 @@ impl TaskRecords {
     }
 
     /// A task is submitted now.
-    pub fn add(&self, task_id: TaskId, urgency: Urgency, goals: Vec<WaypointIx>, now_ms: u64) {
+    pub fn add(&self, task_id: TaskId, class: Class, goals: Vec<WaypointIx>, now_ms: u64) {
         let record = TaskRecord {
-            urgency,
+            class,
             goals,
             submitted_ms: now_ms,
             assigned_ms: None,
             done_ms: None,
-            assignments: 0,
+            reassignments: 0,
+            retries: 0,
             phase: Phase::Queued,
             reason: None,
             epoch: 0,
+            failures: 0,
             robot_id: None,
         };
         let mut records = self.lock();
+        records.waiting.insert(task_id.clone(), now_ms);
         records.tasks.insert(task_id, record);
-        records.waiting += 1;
         records.open += 1;
     }
 
@@ -114,8 +122,12 @@ impl TaskRecords {
         record.reason = state.reason.as_ref().map(|reason| reason.code.as_str());
         if state.epoch > record.epoch {
             record.epoch = state.epoch;
-            record.assignments += 1;
-            record.assigned_ms.get_or_insert(now_ms);
+            let failures = std::mem::replace(&mut record.failures, state.failures);
+            match record.assigned_ms {
+                None => record.assigned_ms = Some(now_ms),
+                Some(_) if state.failures != failures => record.retries += 1,
+                Some(_) => record.reassignments += 1,
+            }
         }
         let has_robot = state.phase.has_attempt();
         let robot_id = state.robot_id.clone().filter(|_| has_robot);
@@ -136,10 +148,10 @@ impl TaskRecords {
         records.failed += u64::from(ends && state.phase != Phase::Succeeded);
         records.open -= usize::from(ends);
         match (is_waiting(before), is_waiting(state.phase)) {
-            (true, false) => records.waiting -= 1,
-            (false, true) => records.waiting += 1,
+            (true, false) => records.waiting.remove(&state.task_id),
+            (false, true) => records.waiting.insert(state.task_id.clone(), now_ms),
             _ => return,
-        }
+        };
         drop(records);
         self.changed.notify_one();
     }
@@ -152,14 +164,25 @@ impl TaskRecords {
     /// What is counted now.
     pub fn counts(&self) -> TaskCounts {
         let records = self.lock();
-        let Records { waiting, open, asking, answers, failed, ended_twice, .. } = &*records;
-        let (waiting, open, failed) = (*waiting, *open, *failed);
-        TaskCounts { waiting, open, asking: asking.len(), answers: *answers, failed, ended_twice: *ended_twice }
+        TaskCounts {
+            waiting: records.waiting.len(),
+            open: records.open,
+            busy: records.busy.len(),
+            asking: records.asking.len(),
+            answers: records.answers,
+            failed: records.failed,
+            ended_twice: records.ended_twice,
+        }
     }
 
     /// Robots that have a task.
     pub fn busy_robots(&self) -> BTreeSet<RobotId> {
         self.lock().busy.keys().cloned().collect()
+    }
+
+    /// Tasks without a robot, and since when, milliseconds since the beginning.
+    pub fn waiting_tasks(&self) -> BTreeMap<TaskId, u64> {
+        self.lock().waiting.clone()
     }
 
     /// Tasks that wait for a person.
@@ -209,7 +232,7 @@ mod tests {
     #[test]
     fn a_task_that_loses_its_robot_waits_again_and_is_done_once() {
         let records = TaskRecords::default();
-        records.add(TaskId::parse("TASK-1").expect("a valid id"), Urgency::Normal, Vec::new(), 10);
+        records.add(TaskId::parse("TASK-1").expect("a valid id"), Class::Normal, Vec::new(), 10);
         assert_eq!((records.counts().waiting, records.counts().open), (1, 1));
         state(&records, Phase::Assigned, 1, 20);
         assert_eq!((records.counts().waiting, records.busy_robots().len()), (0, 1));
@@ -218,7 +241,8 @@ mod tests {
         state(&records, Phase::Running, 2, 40);
         state(&records, Phase::Succeeded, 2, 90);
         let task = records.tasks().pop().expect("one task");
-        assert_eq!((task.assignments, task.assigned_ms, task.done_ms), (2, Some(20), Some(90)));
+        assert_eq!((task.reassignments, task.retries), (1, 0), "no attempt had failed");
+        assert_eq!((task.assigned_ms, task.done_ms, task.has_failed()), (Some(20), Some(90), false));
         let counts = records.counts();
         assert_eq!((counts.waiting, counts.open, counts.failed, counts.ended_twice), (0, 0, 0, 0));
         state(&records, Phase::Failed, 2, 95);

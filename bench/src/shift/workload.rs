@@ -2,8 +2,10 @@
 
 use super::clock::VirtualClock;
 use super::floor::TaskSource;
-use super::task_records::{TaskRecords, Urgency};
+use super::task_records::TaskRecords;
+use anyhow::Context;
 use midshift_core::ids::TaskId;
+use midshift_core::task::spec::Class;
 use midshift_proto::access::local;
 use midshift_proto::task::v1::task_service_server::TaskService as Face;
 use midshift_proto::task::v1::{SubmitTaskRequest, submit_task_request::Body};
@@ -12,11 +14,14 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::time::Instant;
 
 /// Waiting tasks for each robot while a shift is saturated.
 const BACKLOG_PER_ROBOT: usize = 3;
 /// Priority of urgent tasks, of 0 to 9; all others have that of their list.
 const URGENT_PRIORITY: i32 = 0;
+/// Priority of a task that says none.
+const PRIORITY_UNSAID: i32 = 5;
 
 /// When tasks come.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -76,6 +81,8 @@ impl Client {
     /// A task that is refused.
     pub async fn run(mut self, demand: Demand, robots: usize) -> anyhow::Result<()> {
         self.urgent_permille = demand.urgent_permille;
+        // When the next ones come: by the time, however long a submit takes.
+        let mut next = Instant::now();
         match demand.arrivals {
             Arrivals::Saturated => loop {
                 while self.records.counts().waiting < robots * BACKLOG_PER_ROBOT {
@@ -85,14 +92,16 @@ impl Client {
             },
             Arrivals::Steady { per_hour } => loop {
                 let gap_h = -(1.0 - self.rng.random::<f64>()).ln() / per_hour.max(1e-6);
-                tokio::time::sleep(Duration::from_secs_f64(gap_h * 3_600.0)).await;
+                next += Duration::from_secs_f64(gap_h * 3_600.0);
+                tokio::time::sleep_until(next).await;
                 self.submit().await?;
             },
             Arrivals::Waves { tasks, every } => loop {
                 for _ in 0..tasks {
                     self.submit().await?;
                 }
-                tokio::time::sleep(every).await;
+                next += every;
+                tokio::time::sleep_until(next).await;
             },
         }
     }
@@ -102,21 +111,22 @@ impl Client {
         self.asked += 1;
         let task_id = TaskId::parse(&format!("TASK-{:07}", self.asked))?;
         let is_urgent = self.rng.random_range(0..1_000) < self.urgent_permille;
-        let urgency = if is_urgent { Urgency::Urgent } else { Urgency::Normal };
+        let priority = priority_mut(&mut request).context("a task of a form without a priority")?;
         if is_urgent {
-            hurry(&mut request);
+            *priority = Some(URGENT_PRIORITY);
         }
+        let class = Class::from_priority(priority.unwrap_or(PRIORITY_UNSAID) as u8, 0);
         request.task_id = task_id.to_string();
-        self.records.add(task_id, urgency, goals, self.clock.elapsed_ms());
+        self.records.add(task_id, class, goals, self.clock.elapsed_ms());
         self.tasks.submit_task(local(request)).await?;
         Ok(())
     }
 }
 
-fn hurry(request: &mut SubmitTaskRequest) {
+fn priority_mut(request: &mut SubmitTaskRequest) -> Option<&mut Option<i32>> {
     match &mut request.body {
-        Some(Body::Flat(flat)) => flat.priority = Some(URGENT_PRIORITY),
-        Some(Body::Spec(spec)) => spec.priority = Some(URGENT_PRIORITY),
-        Some(Body::Nested(_)) | None => {}
+        Some(Body::Flat(flat)) => Some(&mut flat.priority),
+        Some(Body::Spec(spec)) => Some(&mut spec.priority),
+        Some(Body::Nested(_)) | None => None,
     }
 }
