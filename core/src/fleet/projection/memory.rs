@@ -59,30 +59,42 @@ pub struct MeantFor {
 
 /// Ready tasks that the newest plan means for robots which are free soon. Volatile: no promise.
 #[derive(Clone, Debug, Default)]
-pub struct Meant(BTreeMap<TaskId, MeantFor>);
+pub struct Meant {
+    named: BTreeMap<TaskId, MeantFor>,
+    /// Tasks that were meant for too long, and until when they are meant for no robot, site clock.
+    resting: BTreeMap<TaskId, SiteTime>,
+}
 
 impl Meant {
-    /// A task is meant for no robot for longer than this without getting one, site time.
+    /// A task is meant for no robot for longer than this without getting one, site time; then not again for as long.
     const FOR: SiteDuration = SiteDuration::from_secs(30);
 
     /// For whom a task is meant.
     pub fn get(&self, task_id: &TaskId) -> Option<&MeantFor> {
-        self.0.get(task_id)
+        self.named.get(task_id)
     }
     /// Whether a task was meant for one robot or another for so long that it goes to one that is free.
     pub fn is_over(&self, task_id: &TaskId, now: SiteTime) -> bool {
-        self.get(task_id).is_some_and(|meant| now.since(meant.since) > Self::FOR)
+        let is_resting = || self.resting.get(task_id).is_some_and(|until| now < *until);
+        self.get(task_id).map_or_else(is_resting, |meant| meant.is_over(now))
     }
     /// What a plan means: tasks with their robots, and when those are free.
     pub(in crate::fleet) fn put_plan(&mut self, tasks: Vec<(TaskId, RobotId, Utc)>, now: SiteTime) {
-        let before = std::mem::take(&mut self.0);
+        let (over, before): (BTreeMap<_, _>, BTreeMap<_, _>) =
+            std::mem::take(&mut self.named).into_iter().partition(|(_, meant)| meant.is_over(now));
+        self.resting.retain(|_, until| now < *until);
+        self.resting.extend(over.into_keys().map(|task_id| (task_id, now + Self::FOR)));
         let meant = |(task_id, robot_id, free): (TaskId, RobotId, Utc)| {
-            // Whoever is meant now was not before, if that was too long ago to hold.
-            let since = before.get(&task_id).map(|meant| meant.since).filter(|since| now.since(*since) <= Self::FOR);
-            let since = since.unwrap_or(now);
+            let since = before.get(&task_id).map_or(now, |meant| meant.since);
             (task_id, MeantFor { robot_id, free, since })
         };
-        self.0 = tasks.into_iter().map(meant).collect();
+        self.named = tasks.into_iter().map(meant).collect();
+    }
+}
+
+impl MeantFor {
+    fn is_over(&self, now: SiteTime) -> bool {
+        now.since(self.since) > Meant::FOR
     }
 }
 

@@ -126,6 +126,21 @@ fn a_task_beside_which_another_robot_is_free_soon_waits_for_that_one() {
 }
 
 #[test]
+fn a_task_that_was_meant_for_too_long_and_found_no_robot_is_not_meant_for_one_again_at_once() {
+    let mut rig = one_soon(20);
+    rig.submit("beside", visits(&[101]));
+    rig.cycle(Pace::Wake);
+    // Nobody else could take it.
+    rig.board.remove(&RobotId::parse("idle").expect("an id"));
+    for _ in 0..3 {
+        rig.pass(11_000);
+        rig.cycle(Pace::Wake);
+    }
+    rig.robot("idle", "c10");
+    assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("idle", "beside")]));
+}
+
+#[test]
 fn a_robot_that_is_not_free_within_the_horizon_counts_for_nothing() {
     let mut rig = one_soon(40);
     rig.submit("beside", visits(&[101]));
