@@ -236,7 +236,7 @@ impl<'a> Finder<'a> {
         }
         let known = known.unwrap_or_else(|| {
             let Rank { class, since, .. } = ready.rank;
-            self.found.urgencies.push(Urgency { class, since, deadline: intake.spec.deadline });
+            self.found.urgencies.push(Urgency { class, since, deadline: task.deadline(intake) });
             self.found.tasks.push(task_id.clone());
             self.found.known.insert(task_id.clone(), self.found.tasks.len() - 1);
             self.found.tasks.len() - 1
