@@ -59,6 +59,18 @@ impl TaskService for Unary {
     ) -> Result<Response<v1::ResolveTaskResponse>, Status> {
         not_here()
     }
+    async fn update_task(&self, _: Request<v1::UpdateTaskRequest>) -> Result<Response<v1::UpdateTaskResponse>, Status> {
+        not_here()
+    }
+    async fn hold_task(&self, _: Request<v1::HoldTaskRequest>) -> Result<Response<v1::HoldTaskResponse>, Status> {
+        not_here()
+    }
+    async fn release_task(
+        &self,
+        _: Request<v1::ReleaseTaskRequest>,
+    ) -> Result<Response<v1::ReleaseTaskResponse>, Status> {
+        not_here()
+    }
     async fn cancel_tasks(
         &self,
         _: Request<v1::CancelTasksRequest>,

@@ -1,5 +1,6 @@
 //! `midshift task …`
 
+mod change;
 mod follow;
 mod many;
 mod resume;
@@ -67,6 +68,12 @@ pub enum Verb {
         #[command(flatten)]
         guarded: Guarded,
     },
+    /// Change a task that waits: its priority, its times, its robot.
+    Edit(Box<change::Edit>),
+    /// Hold a task: it waits, or its robot pauses where it may, until it is released.
+    Hold(change::Stand),
+    /// Let a task go on that a person holds.
+    Release(change::Stand),
     /// Answer a task that needs an operator, or with --all every one that is meant.
     Resolve {
         #[command(flatten)]
@@ -132,6 +139,9 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             }
             Ok(())
         }
+        Verb::Edit(args) => change::edit(*args, out).await,
+        Verb::Hold(args) => change::hold(args, out).await,
+        Verb::Release(args) => change::release(args, out).await,
         Verb::Resolve { which, resolution, reason, if_match, change } => {
             let Some(one) = which.one() else {
                 return many::resolve(&which, resolution.wire(), &reason, &change, out).await;
@@ -198,6 +208,9 @@ async fn get(one: &TaskTarget, out: &Out) -> Result<(), Exit> {
             format!("{}  {}  priority {}  {}\n", task.task_id, state(&task), priority(&task), waypoints(&task));
         if let Some(reason) = &task.reason {
             text += &format!("  {}: {}\n", reason.code, plain(&reason.message));
+        }
+        if !task.edited_fields.is_empty() {
+            text += &format!("  changed since it was submitted: {}\n", task.edited_fields.join(", "));
         }
         let allowed = task.allowed_resolutions().filter_map(Answer::word).collect::<Vec<_>>().join(", ");
         if !allowed.is_empty() {

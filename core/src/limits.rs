@@ -207,6 +207,8 @@ pub const CROWD_NAMED_MAX: usize = 8;
 pub const ITEM_ROWS_MAX: usize = 256;
 /// Attempts, places, stops and resumes that a robot lists in one heartbeat, of each: as many as one item may touch rows.
 pub const REPORTED_LIST_MAX: usize = 256;
+/// Answers to requests about one task that its row keeps: the caller of each may ask again for its own as long as so few others came since.
+pub const ANSWERS_OF_TASK: usize = 8;
 /// Hold tokens that one item changes: each costs up to 2 rows.
 pub const HOLDS_PER_ITEM: usize = 64;
 /// Hold tokens of one robot: every stop of the site, and as many that only the robot knows. One that is held by so many needs no more.

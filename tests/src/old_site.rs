@@ -25,7 +25,7 @@ use midshift_core::rollout::spec::RolloutSpec;
 use midshift_core::rows::{Log, Seq, Writer};
 use midshift_core::session::{LaneMark, Session};
 use midshift_core::task::forms::Transport;
-use midshift_core::task::state::RequestKey;
+use midshift_core::task::requests::RequestKey;
 use midshift_core::task::{Attempt, AttemptPhase, Phase, TaskIntake, TaskSpec, TaskState};
 use midshift_core::time::Utc;
 use midshift_store::{Retention, Store};
@@ -139,6 +139,7 @@ impl OldSite {
                 id: format!("submit:{}", intake.request_id),
                 payload_hash: String::new(),
                 task_id: Some(intake.task_id.clone()),
+                request: None,
                 at_unix_ms: at.0,
             };
             task.create(&intake, "task.admitted").create(&state, "task.admitted").create(&key, "request.answered");

@@ -52,6 +52,10 @@ codes! {
         => "Update the server, or ask without it.";
     TaskEnded = "TASK_ENDED", "The task is over and cannot be changed." => "Submit another one.";
     NotAllowedNow = "NOT_ALLOWED_NOW", "The state of the object does not allow this now." => "Read it again.";
+    TaskNotEditable = "TASK_NOT_EDITABLE", "A task changes only while no robot has it or may have it, and no person must answer it."
+        => "Change it once it is QUEUED again, or cancel it and submit another one.";
+    AnswerUnknown = "ANSWER_UNKNOWN", "Nobody knows any more what became of the request: fleet passed it over, or answered many others about the task since."
+        => "`midshift task get TASK` shows the task as it is. Ask again with another request_id.";
     NotStuck = "NOT_STUCK", "The robot is not stuck on its way back from a bundle." => "`midshift robot explain ROBOT` says what it waits for.";
     ResolutionNotAllowed = "RESOLUTION_NOT_ALLOWED", "This resolution is not among the task's allowed resolutions."
         => "`midshift task get TASK` lists those.";
@@ -367,7 +371,7 @@ codes! {
         => "Look at it, then `midshift robot uncordon ROBOT`.";
     PlaceQuarantined = "PLACE_QUARANTINED", "A place, or a seat of it, is kept closed until the robot that may be inside reports or a person clears it."
         => "Look there, then `midshift zone clear PLACE --reason TEXT --if-match ETAG`; `midshift zone ls` shows the ETAG.";
-    HoldByPerson = "HOLD_BY_PERSON", "A person asked for a pause.";
+    HoldByPerson = "HOLD_BY_PERSON", "A person holds the task." => "`midshift task release TASK --reason TEXT` lets it go on.";
     HoldByStop = "HOLD_BY_STOP", "A fleet stop stopped the robot. Reset it, then resume what it held.";
     HoldByBody = "HOLD_BY_BODY", "The robot's own safety system stopped it.";
 }

@@ -119,7 +119,7 @@ pub enum Event {
     Hold,
     /// The last hold token went.
     LastHoldGone,
-    /// Somebody changed a queued task. No producer until edits land.
+    /// Somebody changes what was asked for.
     Edit,
     /// The robot took it.
     Accepted,
@@ -212,7 +212,7 @@ pub struct MachineState {
 }
 
 /// Facts that choose between the outcomes of one table cell.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Facts {
     /// Retries asked for and not spent, counting the attempt that ends now.
     pub retries_left: bool,
@@ -328,6 +328,11 @@ pub fn next(at: MachineState, event: Event, facts: &Facts) -> Option<Next> {
     }
 }
 
+/// Whether what was asked for may change in this phase: no robot has the task, and none may have it.
+pub fn takes_edit(phase: Phase) -> bool {
+    next(MachineState { phase, uncertain: false, then: None }, Event::Edit, &Facts::default()).is_some()
+}
+
 fn go(phase: Phase, action: AttemptAction) -> Option<Next> {
     Some(Next { phase, then: None, action })
 }
@@ -347,7 +352,7 @@ fn waiting(at: MachineState, event: Event) -> Option<Next> {
         (_, Event::Deadline) => go(Phase::Expired, AttemptAction::Keep),
         (_, Event::Cancel | Event::CancelForce) => go(Phase::Canceled, AttemptAction::Keep),
         (Phase::Suspended | Phase::RetryWait, Event::RetryDue) => go(Phase::Queued, AttemptAction::Keep),
-        (_, Event::Hold | Event::LastHoldGone) | (Phase::Queued | Phase::RetryWait, Event::Edit) => stay(at),
+        (_, Event::Hold | Event::LastHoldGone | Event::Edit) => stay(at),
         _ => None,
     }
 }

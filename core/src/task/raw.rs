@@ -2,7 +2,8 @@
 //!
 //! Called by the task service on receipt. The .proto comments state the same rules; a table test holds both together.
 
-use super::spec::{Retry, Selector, TaskSpec};
+use super::edit::is_in_order;
+use super::spec::{DEFAULT_PRIORITY, LEAST_PRIORITY, Retry, Selector, TaskSpec};
 use crate::ids::{RobotId, TaskId, WaypointId};
 use crate::limits;
 use crate::reason::{Refusal, Violations};
@@ -128,8 +129,8 @@ impl RawTask {
         if !name_ok(&self.kind) {
             bad.add(format!("{field}.type"), "is required, 1-64 of [a-z0-9-_]");
         }
-        let priority = self.priority.unwrap_or(5);
-        if !(0..=9).contains(&priority) {
+        let priority = self.priority.unwrap_or(i64::from(DEFAULT_PRIORITY));
+        if !(0..=i64::from(LEAST_PRIORITY)).contains(&priority) {
             bad.add(format!("{field}.priority"), "must be 0..9, 0 most urgent");
         }
         let robot_id = match self.robot_id.as_str() {
@@ -194,9 +195,7 @@ impl RawTask {
                 bad.add(format!("{field}.{name}"), "must be 1 s .. 24 h");
             }
         }
-        if let (Some(from), Some(until)) = (self.not_before, self.deadline)
-            && until <= from
-        {
+        if !is_in_order(self.not_before, self.deadline) {
             bad.add(format!("{field}.deadline"), "must be after not_before");
         }
         self.timeout_ms.unwrap_or(0).max(0) as u64

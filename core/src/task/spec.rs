@@ -6,6 +6,11 @@ use crate::time::Utc;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
+/// Priority of a task that says none.
+pub const DEFAULT_PRIORITY: u8 = 5;
+/// The least urgent priority; 0 is the most urgent.
+pub const LEAST_PRIORITY: u8 = 9;
+
 /// What the caller wants.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TaskSpec {

@@ -1,11 +1,12 @@
-//! The rows of a task: what was asked for, where it is, its attempts, and what people asked afterwards.
+//! The rows of a task: what was asked for, where it is, and its attempts.
 
+use super::edit::TaskEdit;
 use super::machine::{AfterStopping, Phase};
 use super::spec::TaskSpec;
-use crate::audit::Note;
 use crate::authority::Authority;
 use crate::ids::{AttemptId, PlaceId, RobotId, Subject, TaskId, WaypointId};
-use crate::reason::Reason;
+use crate::limits;
+use crate::reason::{Code, Reason};
 use crate::robot::Fault;
 use crate::robot_events::WorkStats;
 use crate::rows::{Index, Record, Table, body_is_json};
@@ -41,6 +42,30 @@ impl Record for TaskIntake {
     fn index(&self) -> Index {
         Index { state: None, parent: None, order: Some(self.number as i64) }
     }
+}
+
+/// Token of a task that a person holds.
+pub const OPERATOR_HOLD: &str = "operator";
+
+/// A person's hold of a task: who, why and since when.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OperatorHold {
+    /// The actor that holds it, by name.
+    pub actor: String,
+    /// Why, in a person's words.
+    pub reason: String,
+    /// UTC, site clock.
+    pub since: Utc,
+}
+
+/// What became of one request to edit, hold or release a task.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RequestAnswer {
+    /// Id of the request's row.
+    pub request: String,
+    /// Why it was not carried out. None: it was.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub refusal: Option<Reason>,
 }
 
 /// Where a task is. Born QUEUED with its intake, changed by fleet alone.
@@ -94,6 +119,18 @@ pub struct TaskState {
     pub changed: Utc,
     /// Sum over its ended attempts.
     pub stats: WorkStats,
+    /// What people changed of what was asked for: goes before the intake.
+    #[serde(default, skip_serializing_if = "TaskEdit::is_empty")]
+    pub edit: TaskEdit,
+    /// UTC, when its priority last changed: it is promoted by the time that it is ready since then. None: never.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub priority_since: Option<Utc>,
+    /// The person behind the token [`OPERATOR_HOLD`]. None: no person holds it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub operator_hold: Option<OperatorHold>,
+    /// Answers to the newest requests to edit, hold or release it, oldest first, at most [`limits::ANSWERS_OF_TASK`].
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub answers: Vec<RequestAnswer>,
 }
 
 impl TaskState {
@@ -124,7 +161,62 @@ impl TaskState {
             ended: None,
             changed: intake.created,
             stats: WorkStats::default(),
+            edit: TaskEdit::default(),
+            priority_since: None,
+            operator_hold: None,
+            answers: Vec::new(),
         }
+    }
+    /// 0 most urgent ..= 9, as it is now.
+    pub fn priority(&self, intake: &TaskIntake) -> u8 {
+        self.edit.priority.unwrap_or(intake.spec.priority)
+    }
+    /// UTC before which it does not begin, as it is now.
+    pub fn not_before(&self, intake: &TaskIntake) -> Option<Utc> {
+        self.edit.not_before.unwrap_or(intake.spec.not_before)
+    }
+    /// UTC after which it is worthless, as it is now.
+    pub fn deadline(&self, intake: &TaskIntake) -> Option<Utc> {
+        self.edit.deadline.unwrap_or(intake.spec.deadline)
+    }
+    /// The only robot that may do it, as it is now. None: any that is able.
+    pub fn pinned_robot<'a>(&'a self, intake: &'a TaskIntake) -> Option<&'a RobotId> {
+        self.edit.robot_id.as_ref().unwrap_or(&intake.spec.robot_id).as_ref()
+    }
+    /// What is wanted now: what was asked for, with what people changed of it.
+    pub fn spec(&self, intake: &TaskIntake) -> TaskSpec {
+        TaskSpec {
+            priority: self.priority(intake),
+            not_before: self.not_before(intake),
+            deadline: self.deadline(intake),
+            robot_id: self.pinned_robot(intake).cloned(),
+            ..intake.spec.clone()
+        }
+    }
+    /// Who holds it and why. None: no person does.
+    pub fn held_by_person(&self) -> Option<Reason> {
+        match &self.operator_hold {
+            None => self.holds.contains(OPERATOR_HOLD).then(|| Code::HoldByPerson.into()),
+            Some(OperatorHold { actor, reason, since }) => {
+                let told = format!("{actor} holds it since {}: {reason}", since.rfc3339());
+                let held = Reason::new(Code::HoldByPerson, told).with("actor", actor);
+                Some(held.with("since", since.rfc3339()))
+            }
+        }
+    }
+    /// Why it is where it is: of one that stands because a person holds it, that.
+    pub fn shown_reason(&self) -> Option<Reason> {
+        let stands = matches!(self.phase, Phase::Queued | Phase::Held);
+        self.held_by_person().filter(|_| stands).or_else(|| self.reason.clone())
+    }
+    /// What became of a request. None: it was not answered, or so many came since that this is forgotten.
+    pub fn answer_to(&self, request: &str) -> Option<&RequestAnswer> {
+        self.answers.iter().find(|answer| answer.request == request)
+    }
+    /// Keeps what became of a request; the oldest of too many answers is forgotten.
+    pub fn note_answer(&mut self, request: &str, refusal: Option<Reason>) {
+        self.answers.push(RequestAnswer { request: request.to_owned(), refusal });
+        self.answers.drain(..self.answers.len().saturating_sub(limits::ANSWERS_OF_TASK));
     }
     /// Id of its newest attempt, if it ever had one.
     pub fn attempt_id(&self) -> Option<AttemptId> {
@@ -329,131 +421,5 @@ impl Record for Attempt {
             Subject::Errand { .. } => self.offered.0.max(Self::ERRANDS_BEHIND + 1),
         };
         Index { state: Some(self.phase.number()), parent, order: Some(order) }
-    }
-}
-
-/// A person's answer to NEEDS_OPERATOR.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Resolution {
-    /// Try again; an opened task goes on at the robot that carries its item.
-    Requeue,
-    /// Try again elsewhere: a person handed the item to whichever robot comes (it goes on after the pick).
-    RequeueHandedOver,
-    /// Try again from the first step: a person put the item back.
-    RequeuePutBack,
-    /// Done by hand.
-    Succeeded,
-    /// Give up.
-    Failed,
-    /// Give up, the item is lost.
-    FailedItemLost,
-    /// Not wanted any more.
-    Canceled,
-}
-
-/// What somebody asks of a task or robot after admission.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Ask {
-    /// End it.
-    Cancel {
-        /// The task that is to end.
-        task_id: TaskId,
-        /// End the record at once; robot and places stay kept until the robot reports.
-        force: bool,
-    },
-    /// Answer NEEDS_OPERATOR.
-    Resolve {
-        /// The task that waits for an operator.
-        task_id: TaskId,
-        /// What the person says of it.
-        resolution: Resolution,
-    },
-    /// Take away `resume:<stop_id>` tokens (of all if none is named) from these tasks and robots.
-    ResumeHeld {
-        /// Only the tokens of this stop.
-        stop_id: Option<String>,
-        /// Everything in this area.
-        area_id: Option<crate::ids::AreaId>,
-        /// These tasks.
-        task_ids: Vec<TaskId>,
-        /// These robots.
-        robot_ids: Vec<RobotId>,
-    },
-}
-
-impl Ask {
-    /// What it leaves in the audit.
-    pub fn note(&self) -> Note {
-        match self {
-            Self::Cancel { task_id, force } => Note::new("task.cancel").about("task", task_id).with("force", force),
-            Self::Resolve { task_id, resolution } => {
-                let word = serde_json::to_value(resolution).unwrap_or_default();
-                let word = word.as_str().map_or_else(|| format!("{resolution:?}"), str::to_owned);
-                Note::new("task.resolve").about("task", task_id).with("resolution", word)
-            }
-            Self::ResumeHeld { stop_id, area_id, task_ids, robot_ids } => {
-                let note = Note::new("task.resume");
-                let note = stop_id.iter().fold(note, |note, id| note.about("stop", id));
-                let note = area_id.iter().fold(note, |note, id| note.about("area", id));
-                let note = task_ids.iter().fold(note, |note, id| note.about("task", id));
-                robot_ids.iter().fold(note, |note, id| note.about("robot", id))
-            }
-        }
-    }
-}
-
-/// One such request: append-only, consumed by fleet in order.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct TaskRequest {
-    /// Drawn at random; unique.
-    pub id: String,
-    /// What the person asks for.
-    pub ask: Ask,
-    /// Why, as the person said.
-    pub reason: String,
-    /// The actor that asks, by name.
-    pub actor: String,
-    /// UTC of the wall.
-    pub at_unix_ms: i64,
-}
-
-impl Record for TaskRequest {
-    const TABLE: Table = Table::TaskRequest;
-    body_is_json!();
-    fn id(&self) -> String {
-        self.id.clone()
-    }
-    fn index(&self) -> Index {
-        let parent = match &self.ask {
-            Ask::Cancel { task_id, .. } | Ask::Resolve { task_id, .. } => Some(task_id.as_str().into()),
-            Ask::ResumeHeld { .. } => None,
-        };
-        Index { parent, order: Some(self.at_unix_ms), ..Index::default() }
-    }
-}
-
-/// A used request_id and what it was answered: kept 7 days.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RequestKey {
-    /// The client's request_id, with the verb before it.
-    pub id: String,
-    /// SHA-256 of the request's canonical form, hex.
-    pub payload_hash: String,
-    /// The task it is about.
-    pub task_id: Option<TaskId>,
-    /// UTC of the wall.
-    pub at_unix_ms: i64,
-}
-
-impl Record for RequestKey {
-    const TABLE: Table = Table::RequestKey;
-    body_is_json!();
-    fn id(&self) -> String {
-        self.id.clone()
-    }
-    fn index(&self) -> Index {
-        Index { order: Some(self.at_unix_ms), ..Index::default() }
     }
 }

@@ -9,10 +9,11 @@ use midshift_core::limits;
 use midshift_core::reason::{Refusal, Violations};
 use midshift_core::rows::Revision;
 use midshift_core::step::{Effect, StepKind, WorkStep};
+use midshift_core::task::edit::is_in_order;
 use midshift_core::task::forms::Transport;
 use midshift_core::task::raw::{RawRetry, RawStep, RawStepKind};
-use midshift_core::task::spec::{Retry, Selector};
-use midshift_core::task::{Attempt, Phase, RawTask, Resolution, TaskIntake, TaskSpec, TaskState};
+use midshift_core::task::spec::{DEFAULT_PRIORITY, LEAST_PRIORITY, Retry, Selector};
+use midshift_core::task::{Attempt, Phase, RawTask, Resolution, TaskEdit, TaskIntake, TaskSpec, TaskState};
 use midshift_core::time::Utc;
 use prost::Message;
 use std::collections::{BTreeMap, BTreeSet};
@@ -334,12 +335,12 @@ pub fn encode_task(view: TaskView<'_>) -> v1::Task {
     let id_text = |id: &Option<RobotId>| id.as_ref().map(ToString::to_string).unwrap_or_default();
     v1::Task {
         task_id: intake.task_id.to_string(),
-        spec: Some((&intake.spec).into()),
+        spec: Some((&state.spec(intake)).into()),
         state: state.phase.to_wire(),
         etag: etag(revision),
         create_time: Some(timestamp(intake.created)),
         update_time: Some(timestamp(state.changed)),
-        reason: state.reason.as_ref().map(shown),
+        reason: state.shown_reason().as_ref().map(shown),
         then: state.then.map(WireEnum::to_wire).unwrap_or_default(),
         hold_tokens: state.holds.iter().cloned().collect(),
         allowed_resolutions: allowed.iter().map(|r| r.to_wire()).collect(),
@@ -359,6 +360,12 @@ pub fn encode_task(view: TaskView<'_>) -> v1::Task {
         failed_robot_ids: state.failed_robots.iter().map(ToString::to_string).collect(),
         actor: intake.actor.clone(),
         number: intake.number,
+        edited_fields: state.edit.fields().map(str::to_owned).collect(),
+        operator_hold: state.operator_hold.as_ref().map(|hold| v1::OperatorHold {
+            actor: hold.actor.clone(),
+            reason: hold.reason.clone(),
+            since: Some(timestamp(hold.since)),
+        }),
     }
 }
 
@@ -370,6 +377,52 @@ pub fn encode_checked(spec: &TaskSpec) -> v1::Task {
 /// A revision as an etag.
 pub fn etag(revision: Revision) -> String {
     revision.0.to_string()
+}
+
+/// Paths of a mask that are looked at: more than there are fields.
+const PATHS_MAX: usize = 32;
+/// Characters of an unknown path that are said.
+const PATH_SHOWN: usize = 64;
+
+/// The change that an update asks for.
+pub fn read_update(
+    mask: Option<&prost_types::FieldMask>,
+    update: v1::TaskUpdate,
+    bad: &mut Violations,
+) -> Option<TaskEdit> {
+    let (before, at) = (bad.0.len(), At::top("update"));
+    let paths = mask.map_or(&[][..], |mask| &mask.paths);
+    if paths.is_empty() {
+        bad.add("update_mask", "is required: name the fields that change, of priority, robot_id, not_before, deadline");
+    }
+    if paths.len() > PATHS_MAX {
+        bad.add("update_mask", "must be at most 32 paths");
+    }
+    let mut edit = TaskEdit::default();
+    for (i, path) in paths.iter().take(PATHS_MAX).enumerate() {
+        match path.as_str() {
+            "priority" => match u8::try_from(update.priority.unwrap_or(i32::from(DEFAULT_PRIORITY))) {
+                Ok(priority) if priority <= LEAST_PRIORITY => edit.priority = Some(priority),
+                _ => bad.add(at.field("priority").to_string(), "must be 0..9, 0 most urgent"),
+            },
+            "robot_id" => {
+                edit.robot_id = maybe_id(&update.robot_id, RobotId::parse, at.field("robot_id"), bad);
+            }
+            "not_before" => {
+                edit.not_before = Some(parse_time(update.not_before.as_ref(), at.field("not_before"), bad));
+            }
+            "deadline" => edit.deadline = Some(parse_time(update.deadline.as_ref(), at.field("deadline"), bad)),
+            other => {
+                let named: String = other.chars().take(PATH_SHOWN).collect();
+                let told = format!("{named:?} is none of priority, robot_id, not_before, deadline");
+                bad.add(format!("update_mask.paths[{i}]"), told);
+            }
+        }
+    }
+    if !is_in_order(edit.not_before.flatten(), edit.deadline.flatten()) {
+        bad.add(at.field("deadline").to_string(), "must be after not_before");
+    }
+    (bad.0.len() == before).then_some(edit)
 }
 
 /// An etag as the revision it names. Empty: whatever it is. One that was never given out names no revision and so matches none.

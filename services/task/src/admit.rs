@@ -7,11 +7,11 @@ use crate::TaskService;
 use crate::rows::{TaskRows, are_seen, read, unavailable, unknown_robot};
 use midshift_core::audit::Note;
 use midshift_core::identity::{Caller, Permission};
-use midshift_core::ids::{RequestId, TaskId};
+use midshift_core::ids::{RequestId, RobotId, TaskId};
 use midshift_core::item::Item;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violation};
 use midshift_core::rows::{Table, Writer};
-use midshift_core::task::state::RequestKey;
+use midshift_core::task::requests::RequestKey;
 use midshift_core::task::{TaskIntake, TaskSpec, TaskState};
 use midshift_core::time::Utc;
 use midshift_proto::convert::shown;
@@ -153,6 +153,7 @@ impl TaskService {
                 id: request_id.to_string(),
                 payload_hash: wanted.hash.clone(),
                 task_id: Some(task_id.clone()),
+                request: None,
                 at_unix_ms: now.wall.0,
             };
             item.create(&key, "request.used");
@@ -257,8 +258,8 @@ impl TaskService {
     }
 
     /// What a caller should know of a task that is admitted all the same: that it names a robot that nobody knows.
-    pub async fn notes(&self, spec: &TaskSpec) -> Result<Vec<Reason>, Refusal> {
-        let unknown = unknown_robot(self.store(), spec.robot_id.as_slice()).await?;
+    pub async fn notes(&self, pin: &Option<RobotId>) -> Result<Vec<Reason>, Refusal> {
+        let unknown = unknown_robot(self.store(), pin.as_slice()).await?;
         let note = |robot_id| Reason::from(Code::PinnedRobotUnknown).with("robot_id", robot_id);
         Ok(unknown.map(note).into_iter().collect())
     }
@@ -271,7 +272,7 @@ impl TaskService {
         };
         if request.validate_only {
             let spec = self.check(request, by).await?.spec;
-            return Ok(answer(encode_checked(&spec), self.notes(&spec).await?));
+            return Ok(answer(encode_checked(&spec), self.notes(&spec.robot_id).await?));
         }
         let durable = match self.prepare(request, by).await? {
             Prepared::New(admission) => self.admit(*admission, by).await?,
@@ -279,12 +280,12 @@ impl TaskService {
         };
         match durable {
             Durable::New(intake) => {
-                let notes = self.notes(&intake.spec).await?;
+                let notes = self.notes(&intake.spec.robot_id).await?;
                 Ok(answer(TaskRows::born(*intake).encode(), notes))
             }
             Durable::Known(task_id) => {
                 let task = read(self.store(), &task_id).await?;
-                let notes = self.notes(&task.intake.spec).await?;
+                let notes = self.notes(&task.intake.spec.robot_id).await?;
                 Ok(answer(task.encode(), notes))
             }
         }

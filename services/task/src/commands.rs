@@ -1,4 +1,5 @@
-//! What people ask of admitted tasks: cancel, resolve; `resume` is a room of its own. The request is made durable; fleet obeys it; we wait a little and show the task.
+//! What people ask of admitted tasks: cancel, resolve; `resume` and `task_changes` are rooms of their own. The request is made durable; fleet obeys it; we wait a
+//! little and show the task.
 //!
 //! Invariant: whether fleet has looked at a request is read from fleet's own mark, never guessed from how a task looks. A repeat of a
 //! request_id with the same body is the same request: it writes nothing and its etag is not asked for again.
@@ -14,7 +15,7 @@ use midshift_core::item::Item;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::rows::{Revision, Seq, Writer};
-use midshift_core::task::state::RequestKey;
+use midshift_core::task::requests::{RequestKey, check_alive};
 use midshift_core::task::{Ask, Phase, Resolution, TaskRequest};
 use midshift_proto::convert::WireEnum;
 use midshift_proto::convert::task::revision_of;
@@ -27,7 +28,16 @@ use std::time::Duration;
 /// Entries about one request_id read at a time; there are one or two.
 const ENTRIES: usize = 16;
 
+/// A request that is durable.
+pub(crate) struct DurableRequest {
+    /// Its number in the log; 0: fleet has looked at it long ago.
+    place: Seq,
+    /// Id of its row. None: an older version wrote it.
+    pub(crate) id: Option<String>,
+}
+
 /// A command for a task, before its request is durable.
+#[derive(Clone)]
 pub(crate) struct PendingCommand {
     pub(crate) ask: Ask,
     pub(crate) reason: String,
@@ -71,15 +81,16 @@ pub(crate) fn internal() -> Refusal {
     Refusal::new(Kind::Internal, Code::Internal)
 }
 
-fn ended(task: &TaskRows) -> Refusal {
-    let reason = Reason::from(Code::TaskEnded).with("state", task.state.phase.as_str());
-    Refusal::new(Kind::Precondition, reason.with("task_id", &task.state.task_id))
+/// What a task refuses for how it is.
+pub(crate) fn refused(reason: Reason) -> Refusal {
+    let is_conflict = matches!(reason.code, Code::EtagMismatch | Code::AnswerUnknown);
+    Refusal::new(if is_conflict { Kind::Conflict } else { Kind::Precondition }, reason)
 }
 
 fn same_etag(seen: Option<Revision>, task: &TaskRows) -> Result<(), Refusal> {
     match seen {
         Some(seen) if seen != task.revision => {
-            Err(Refusal::new(Kind::Conflict, Reason::from(Code::EtagMismatch).with("etag", task.revision.0)))
+            Err(refused(Reason::from(Code::EtagMismatch).with("etag", task.revision.0)))
         }
         _ => Ok(()),
     }
@@ -108,7 +119,8 @@ impl TaskService {
             return Ok(v1::CancelTaskResponse { task: Some(task.encode()), pending: false });
         }
         let fits = || {
-            if task.state.phase.is_terminal() { Err(ended(&task)) } else { same_etag(revision_of(&r.etag), &task) }
+            check_alive(&task.state).map_err(refused)?;
+            same_etag(revision_of(&r.etag), &task)
         };
         let fits = if earlier.is_none() { fits() } else { Ok(()) };
         let (ask, robot_id) = (Ask::Cancel { task_id: task_id.clone(), force: r.force }, task.state.robot_id.clone());
@@ -149,9 +161,7 @@ impl TaskService {
         };
         let earlier = self.asked_before(request_id.as_ref(), &hash).await?;
         let fits = || {
-            if task.state.phase.is_terminal() {
-                return Err(ended(&task));
-            }
+            check_alive(&task.state).map_err(refused)?;
             same_etag(seen, &task)?;
             if !task.allowed.contains(&resolution) {
                 let reason = Reason::from(Code::ResolutionNotAllowed).with("state", task.state.phase.as_str());
@@ -176,10 +186,13 @@ impl TaskService {
         &self,
         request_id: Option<&RequestId>,
         hash: &str,
-    ) -> Result<Option<Seq>, Refusal> {
+    ) -> Result<Option<DurableRequest>, Refusal> {
         let Some(id) = request_id else { return Ok(None) };
         match load::<RequestKey>(self.store(), id.as_str()).await.map_err(unavailable)? {
-            Some((key, _)) if key.payload_hash == hash => self.place_of(id).await.map(Some).map_err(unavailable),
+            Some((key, _)) if key.payload_hash == hash => {
+                let place = self.place_of(id).await.map_err(unavailable)?;
+                Ok(Some(DurableRequest { place, id: key.request }))
+            }
             Some(_) => Err(reused(id)),
             None => Ok(None),
         }
@@ -210,12 +223,30 @@ impl TaskService {
     }
 
     /// Makes a request durable unless it is a repeat, and waits a little for fleet. True: fleet has not looked at it yet.
-    pub(crate) async fn submit_command(&self, earlier: Option<Seq>, asked: PendingCommand) -> Result<bool, Refusal> {
-        let place = match earlier {
-            Some(place) => place,
-            None => self.write(asked).await?,
-        };
-        Ok(!self.looked_at(place).await?)
+    pub(crate) async fn submit_command(
+        &self,
+        earlier: Option<DurableRequest>,
+        asked: PendingCommand,
+    ) -> Result<bool, Refusal> {
+        let request = self.make_durable(earlier, asked).await?;
+        Ok(!self.has_looked(&request).await?)
+    }
+
+    /// Makes a request durable unless it is a repeat.
+    pub(crate) async fn make_durable(
+        &self,
+        earlier: Option<DurableRequest>,
+        asked: PendingCommand,
+    ) -> Result<DurableRequest, Refusal> {
+        match earlier {
+            Some(earlier) => Ok(earlier),
+            None => self.write(asked).await,
+        }
+    }
+
+    /// Waits a little until fleet has looked at a request.
+    pub(crate) async fn has_looked(&self, request: &DurableRequest) -> Result<bool, Refusal> {
+        self.looked_at(request.place).await
     }
 
     /// Leaves it in the audit if the caller may not, and gives the refusal back. What it may not even see is about nothing that there is.
@@ -245,30 +276,33 @@ impl TaskService {
         fits
     }
 
-    /// The item of a request. The key goes first, so that the number of the item is that of the request itself.
-    pub(crate) fn item_of(&self, asked: &PendingCommand) -> Item {
+    /// The item of a request, and the id of its row. The key goes first, so that the number of the item is that of the request itself.
+    pub(crate) fn item_of(&self, asked: &PendingCommand) -> (Item, String) {
         let now = self.inner.parts.clock.now();
         let mut item = Item::new(Writer::Task, &asked.actor);
         item.request_id = asked.request_id.as_ref().map(|r| r.as_str().into());
+        let id = format!("{:013}-{:016x}", now.wall.0, rand::random::<u64>());
         if let Some(request_id) = &asked.request_id {
             let key = RequestKey {
                 id: request_id.to_string(),
                 payload_hash: asked.hash.clone(),
                 task_id: None,
+                request: Some(id.clone()),
                 at_unix_ms: now.wall.0,
             };
             item.create(&key, "request.used");
         }
         item.audit(asked.note());
-        let id = format!("{:013}-{:016x}", now.wall.0, rand::random::<u64>());
         let (ask, reason, actor) = (asked.ask.clone(), asked.reason.clone(), asked.actor.to_string());
-        item.create(&TaskRequest { id, ask, reason, actor, at_unix_ms: now.wall.0 }, "task.asked");
-        item
+        let request = TaskRequest { id: id.clone(), ask, reason, actor, at_unix_ms: now.wall.0 };
+        item.create(&request, "task.asked");
+        (item, id)
     }
 
-    async fn write(&self, asked: PendingCommand) -> Result<Seq, Refusal> {
-        match self.commit(vec![self.item_of(&asked)]).await.pop().ok_or_else(no_result)? {
-            Ok(applied) => Ok(applied.seq),
+    async fn write(&self, asked: PendingCommand) -> Result<DurableRequest, Refusal> {
+        let (item, id) = self.item_of(&asked);
+        match self.commit(vec![item]).await.pop().ok_or_else(no_result)? {
+            Ok(applied) => Ok(DurableRequest { place: applied.seq, id: Some(id) }),
             // The same call came in twice at once, or the id was used in between.
             Err(CommitError::Conflict { .. }) => {
                 self.asked_before(asked.request_id.as_ref(), &asked.hash).await?.ok_or_else(no_result)

@@ -223,7 +223,7 @@ impl TaskService {
                     drop(self.noted(&asked, Err(refusal)).await);
                 }
                 None if bulk.validate_only => count.asked += 1,
-                None => items.push(self.item_of(&asked)),
+                None => items.push(self.item_of(&asked).0),
             }
         }
         for slice in items.chunks(limits::SUBMIT_SLICE) {

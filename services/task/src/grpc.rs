@@ -97,6 +97,21 @@ impl Face for TaskService {
         let (id, by) = (CallId::of_request(&r, &r.get_ref().request_id), caller(&r));
         id.answer(self.resolve(r.into_inner(), &by).await)
     }
+    async fn update_task(&self, r: Request<v1::UpdateTaskRequest>) -> Result<Response<v1::UpdateTaskResponse>, Status> {
+        let (id, by) = (CallId::of_request(&r, &r.get_ref().request_id), caller(&r));
+        id.answer(self.update(r.into_inner(), &by).await)
+    }
+    async fn hold_task(&self, r: Request<v1::HoldTaskRequest>) -> Result<Response<v1::HoldTaskResponse>, Status> {
+        let (id, by) = (CallId::of_request(&r, &r.get_ref().request_id), caller(&r));
+        id.answer(self.hold(r.into_inner(), &by).await)
+    }
+    async fn release_task(
+        &self,
+        r: Request<v1::ReleaseTaskRequest>,
+    ) -> Result<Response<v1::ReleaseTaskResponse>, Status> {
+        let (id, by) = (CallId::of_request(&r, &r.get_ref().request_id), caller(&r));
+        id.answer(self.release(r.into_inner(), &by).await)
+    }
     async fn cancel_tasks(
         &self,
         r: Request<v1::CancelTasksRequest>,

@@ -1,4 +1,4 @@
-//! Task intake as a service: admits, shows, cancels, resolves and watches tasks. It decides nothing about robots.
+//! Task intake as a service: admits, shows, changes, holds, cancels, resolves and watches tasks. It decides nothing about robots.
 //!
 //! Called by the server. Invariant: an answer leaves only after its commit; a task is stored whole or not at all; what happens to an
 //! admitted task is fleet's.
@@ -14,6 +14,7 @@ mod prune;
 mod resume;
 mod rows;
 mod search;
+mod task_changes;
 mod watch;
 mod watch_state;
 

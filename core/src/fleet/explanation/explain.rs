@@ -81,7 +81,7 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
         ))
     });
     let eligible = candidates.iter().any(|c| c.reason.is_none());
-    let awaited = match &intake.spec.robot_id {
+    let awaited = match task.pinned_robot(intake) {
         Some(pinned) => candidates.iter().find(|c| c.robot_id == *pinned).map_or_else(|| absent(pinned), awaited),
         None => candidates.first().map_or_else(|| "a robot: none has connected".to_owned(), awaited),
     };

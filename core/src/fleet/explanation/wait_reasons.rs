@@ -57,6 +57,7 @@ pub fn of_task(
             )
         }
         Phase::Suspended => task.reason.clone().map(|why| why.with(WAITS_FOR, "its return to the queue")),
+        Phase::Held if task.held_by_person().is_some() => held_by_person(task),
         Phase::Held if !task.holds.is_empty() => task.holds.first().map(|token| held(Code::WaitingForHold, token)),
         Phase::Assigned | Phase::Running | Phase::Held | Phase::Stopping => {
             let a = task.attempt_id().and_then(|id| view.attempt(&id))?;
@@ -74,11 +75,18 @@ fn queued(view: &FleetProjection, board: &Board, now: &Now, task: &TaskState, in
     };
     let what = match Wait::of_task(task, intake, &view.ended, now.utc) {
         Wait::Time(at) => at.rfc3339(),
+        Wait::Hold(_) if task.held_by_person().is_some() => return held_by_person(task),
         Wait::Hold(token) => return Some(held(why.code, &token)),
         Wait::Dependency(id) | Wait::Failed(id) => format!("task {id}"),
         Wait::Turn(_) | Wait::Mark => task.robot_id.as_ref().map(|r| format!("robot {r}")).unwrap_or_default(),
     };
     Some(why.with(WAITS_FOR, what))
+}
+
+/// Who holds a task, and what lets it go on.
+fn held_by_person(task: &TaskState) -> Option<Reason> {
+    let release = format!("a person: midshift task release {} --reason TEXT", task.task_id);
+    task.held_by_person().map(|why| why.with(WAITS_FOR, release))
 }
 
 /// The robot at work that a ready task is meant for, as long as one may be.

@@ -4,6 +4,7 @@
 
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::{HoldToken, RobotControl};
+use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::transitions::{self, News, apply_event};
 use crate::ids::RobotId;
 use crate::reason::{Code, Reason};
@@ -47,10 +48,16 @@ pub fn holds_changed(tx: &mut Tx, robot_id: &RobotId) {
     tx.view.dirty.insert(robot_id.clone());
     let Some(task_id) = tx.view.held_by(robot_id).and_then(|a| a.subject.task_id().cloned()) else { return };
     let Some(task) = tx.view.task(&task_id).cloned() else { return };
-    let fleet_stop =
-        tx.view.robot_holds(robot_id).all(|h| h.token != stop_token(robot_id) && h.token != resume_token(robot_id));
-    let why: Reason = if fleet_stop { Code::HoldByStop } else { Code::HoldByBody }.into();
-    let event = if transitions::is_held(tx, &task) { Event::Hold } else { Event::LastHoldGone };
-    let why = (event == Event::Hold).then_some(&why);
-    apply_event(tx, &task_id, News::from_event(event, why));
+    if !transitions::go_on_unless_held(tx, &task) {
+        let why = why_held(tx.view, robot_id);
+        apply_event(tx, &task_id, News::from_event(Event::Hold, why.as_ref()));
+    }
+}
+
+/// Why a robot is held: by a fleet stop, or by its own safety system. None: no token of it stands.
+pub(super) fn why_held(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> {
+    let is_own = |h: &HoldToken| h.token == stop_token(robot_id) || h.token == resume_token(robot_id);
+    let mut tokens = view.robot_holds(robot_id).peekable();
+    tokens.peek()?;
+    Some(if tokens.any(is_own) { Code::HoldByBody } else { Code::HoldByStop }.into())
 }

@@ -1,11 +1,13 @@
-//! Obeys what people asked of tasks and robots: cancel, resolve, resume. Requests are durable before they come here.
+//! Obeys what people asked of tasks and robots: cancel, resolve, resume, and by `task_changes` edit, hold and release. Requests are durable
+//! before they come here.
 
 use super::holds::holds_changed;
 use super::stops;
+use super::task_changes::change_task;
 use crate::fleet::decision::plan::{Plan, Tx, mark};
 use crate::fleet::projection::rows::HoldToken;
 use crate::fleet::projection::state::FleetProjection;
-use crate::fleet::tasks::transitions::{News, apply_event};
+use crate::fleet::tasks::transitions::{News, apply_event, go_on_unless_held};
 use crate::fleet::traffic::grants;
 use crate::ids::{AreaId, RobotId, TaskId};
 use crate::limits;
@@ -27,7 +29,7 @@ pub fn obey_request(
         Ask::ResumeHeld { stop_id, area_id, task_ids, robot_ids } => {
             resumes(view, stop_id.as_deref(), area_id.as_ref(), task_ids, robot_ids)
         }
-        Ask::Cancel { .. } | Ask::Resolve { .. } => Vec::new(),
+        _ => Vec::new(),
     };
     let mut decide = |decision: &mut dyn FnMut(&mut Tx)| -> bool {
         let mut tx = Tx::new(view, now, &request.actor).on_request(entry.request_id.as_deref());
@@ -46,6 +48,9 @@ pub fn obey_request(
         match &request.ask {
             Ask::Cancel { task_id, force } => cancel(tx, task_id, *force, request),
             Ask::Resolve { task_id, resolution } => resolve(tx, task_id, *resolution, request),
+            Ask::Edit { task_id, .. } | Ask::Hold { task_id } | Ask::Release { task_id } => {
+                change_task(tx, task_id, request);
+            }
             Ask::ResumeHeld { .. } => {}
         }
         mark(tx, entry.seq);
@@ -150,11 +155,8 @@ fn resume(tx: &mut Tx, resume: &Resume) {
         Resume::Task(task_id, tokens) => {
             let Some(mut task) = tx.view.task(task_id).cloned() else { return };
             task.holds.retain(|h| !tokens.contains(h));
-            let free = task.holds.is_empty();
-            tx.put_row(task, "task.resumed");
-            if free {
-                apply_event(tx, task_id, News::from_event(Event::LastHoldGone, None));
-            }
+            tx.put_row(task.clone(), "task.resumed");
+            go_on_unless_held(tx, &task);
         }
     }
 }

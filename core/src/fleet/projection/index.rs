@@ -15,8 +15,11 @@ use crate::task::{Attempt, Phase, TaskIntake, TaskState};
 use crate::time::Utc;
 
 impl Indexed<TaskState> for FleetProjection {
-    fn changed(view: &mut Self, id: &str, _old: Option<&TaskState>) {
+    fn changed(view: &mut Self, id: &str, old: Option<&TaskState>) {
         let Ok(task_id) = TaskId::parse(id) else { return };
+        let (task, intake) = (view.task(&task_id), view.intake(&task_id));
+        let (before, now) = (deadline(old, intake), deadline(task, intake));
+        move_deadline(view, &task_id, before, now);
         if let Some(task) = view.tasks.get(id).map(|t| &t.row) {
             view.dirty.extend(task.robot_id.clone());
             view.unasked.remove(&task_id);
@@ -24,10 +27,6 @@ impl Indexed<TaskState> for FleetProjection {
             if !phase.is_terminal() {
                 note_open(view, &task_id);
             } else {
-                let deadline = view.intake(&task_id).and_then(|intake| intake.spec.deadline);
-                if let Some(at) = deadline {
-                    view.deadlines.remove(&(at, task_id.clone()));
-                }
                 note_end(view, &task_id, phase);
             }
         }
@@ -49,8 +48,9 @@ impl Indexed<TaskIntake> for FleetProjection {
         }
         old.into_iter().for_each(|old| view.waits_no_more(old));
         if let Ok(task_id) = TaskId::parse(id) {
-            let deadline = view.intake(&task_id).and_then(|intake| intake.spec.deadline);
-            view.deadlines.extend(deadline.map(|at| (at, task_id.clone())));
+            let (task, intake) = (view.task(&task_id), view.intake(&task_id));
+            let (before, now) = (deadline(task, old), deadline(task, intake));
+            move_deadline(view, &task_id, before, now);
             put_in_queue(view, &task_id);
         }
     }
@@ -163,19 +163,42 @@ impl Indexed<Place> for FleetProjection {
     }
 }
 
+/// When a task that has not ended is worthless, as far as its rows are here; UTC.
+fn deadline(task: Option<&TaskState>, intake: Option<&TaskIntake>) -> Option<Utc> {
+    match (task, intake) {
+        (Some(task), _) if task.phase.is_terminal() => None,
+        (Some(task), Some(intake)) => task.deadline(intake),
+        (None, Some(intake)) => intake.spec.deadline,
+        (_, None) => None,
+    }
+}
+
+/// A row of a task changed, and its deadline with it, if so.
+fn move_deadline(view: &mut FleetProjection, task_id: &TaskId, old: Option<Utc>, new: Option<Utc>) {
+    if old == new {
+        return;
+    }
+    if let Some(at) = old {
+        view.deadlines.remove(&(at, task_id.clone()));
+    }
+    view.deadlines.extend(new.map(|at| (at, task_id.clone())));
+}
+
 /// Puts a task where its rows say that it stands: out of the queue, if it waits for no robot.
 pub(in crate::fleet) fn put_in_queue(view: &mut FleetProjection, task_id: &TaskId) {
     let rows = view.task(task_id).filter(|task| task.phase == Phase::Queued).zip(view.intake(task_id));
     let wait = rows.map(|(task, intake)| {
         let wait = match Wait::of_task(task, intake, &view.ended, view.queue.now) {
-            Wait::Turn(rank) if view.bugs.nobody_is_promoted() => Wait::Turn(rank.unpromoted(intake.spec.priority)),
+            Wait::Turn(rank) if view.bugs.nobody_is_promoted() => Wait::Turn(rank.unpromoted(task.priority(intake))),
             wait => wait,
         };
         (wait, task.queued_since)
     });
     view.queue.set_wait(task_id, wait);
     let rows = view.tasks.get(task_id.as_str()).map(|t| &t.row).zip(view.intakes.get(task_id.as_str()).map(|i| &i.row));
-    view.ready.put_task(task_id, view.queue.rank(task_id), rows, |goal| view.site.find(goal));
+    if view.ready.put_task(task_id, view.queue.rank(task_id), rows, |goal| view.site.find(goal)) {
+        view.queue.show_again(task_id);
+    }
 }
 
 /// A task has ended: those that depend on it, if there are any, wait for the next thing, or for nothing more.

@@ -9,6 +9,7 @@ use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::task::spec::Class;
+use crate::task::state::OPERATOR_HOLD;
 use crate::task::{Phase, TaskIntake, TaskState};
 use crate::time::Utc;
 use std::collections::{BTreeMap, BTreeSet};
@@ -21,7 +22,7 @@ const MILESTONE: usize = 64;
 /// Where a ready task stands. The smallest is served first.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Rank {
-    /// Class by priority, one up for each [`limits::MAX_WAIT`] that it is ready.
+    /// Class by priority, one up for each [`limits::MAX_WAIT`] that it is ready with this priority.
     pub class: Class,
     /// It came up by waiting: after those whose class is their own.
     pub promoted: bool,
@@ -33,14 +34,18 @@ pub struct Rank {
     number: u64,
     /// Makes the order total.
     pub task_id: TaskId,
+    /// UTC, site clock, from when on it is promoted: since it is ready with this priority.
+    promoted_from: Utc,
 }
 
 impl Rank {
     fn of_task(task: &TaskState, intake: &TaskIntake, since: Utc, now: Utc) -> Self {
-        let class = Class::from_priority(intake.spec.priority, promotions(since, now));
-        let promoted = class != Class::from_priority(intake.spec.priority, 0);
-        let priority = if promoted { 0 } else { intake.spec.priority };
-        Self { class, promoted, priority, since, number: task.number, task_id: task.task_id.clone() }
+        let priority = task.priority(intake);
+        let promoted_from = task.priority_since.map_or(since, |changed| changed.max(since));
+        let class = Class::from_priority(priority, promotions(promoted_from, now));
+        let promoted = class != Class::from_priority(priority, 0);
+        let (priority, task_id) = (if promoted { 0 } else { priority }, task.task_id.clone());
+        Self { class, promoted, priority, since, number: task.number, task_id, promoted_from }
     }
 }
 
@@ -76,7 +81,7 @@ pub enum Wait {
 impl Wait {
     /// What a task waits for, whatever its phase.
     pub fn of_task(task: &TaskState, intake: &TaskIntake, ended: &BTreeMap<TaskId, Phase>, now: Utc) -> Self {
-        if let Some(at) = intake.spec.not_before.filter(|at| *at > now) {
+        if let Some(at) = task.not_before(intake).filter(|at| *at > now) {
             return Self::Time(at);
         }
         if let Some(token) = task.holds.first() {
@@ -100,6 +105,7 @@ impl Wait {
         Some(match self {
             Self::Turn(_) | Self::Mark => return None,
             Self::Time(_) => Code::WaitingForTime.into(),
+            Self::Hold(token) if token == OPERATOR_HOLD => Code::HoldByPerson.into(),
             Self::Hold(token) => Reason::from(Code::WaitingForHold).with("token", token),
             Self::Dependency(id) => Reason::from(Code::WaitingForDependency).with("task_id", id),
             Self::Failed(id) => Reason::from(Code::DependencyFailed).with("task_id", id),
@@ -128,7 +134,7 @@ impl Waiting {
         };
         let due = match &wait {
             Wait::Time(at) => Some(*at),
-            Wait::Turn(rank) => Some(after(rank.since)),
+            Wait::Turn(rank) => Some(after(rank.promoted_from)),
             Wait::Mark | Wait::Hold(_) | Wait::Dependency(_) | Wait::Failed(_) => None,
         };
         Self { wait, due, age, check: age.map(after) }
@@ -249,6 +255,11 @@ impl Queue {
         }
         Walk { robots: fresh, only: None, after: None }
     }
+    /// Something else than its place changed of a ready task: robots that passed it over look at it again.
+    pub(in crate::fleet) fn show_again(&mut self, task_id: &TaskId) {
+        let rank = self.rank(task_id).cloned();
+        self.news.extend(rank);
+    }
     /// The walk goes on in the next turn.
     pub(in crate::fleet) fn pause(&mut self, walk: Walk) {
         self.paused = Some(walk);
@@ -365,7 +376,8 @@ mod tests {
 
     fn rank(n: u64) -> Rank {
         let task_id = TaskId::parse(&format!("T{n:04}")).expect("an id");
-        Rank { class: Class::from_priority(5, 0), promoted: false, priority: 5, since: Utc(0), number: n, task_id }
+        let (class, since) = (Class::from_priority(5, 0), Utc(0));
+        Rank { class, promoted: false, priority: 5, since, number: n, task_id, promoted_from: since }
     }
 
     #[test]

@@ -71,30 +71,30 @@ impl ReadyTasks {
         self.by_robot.get(robot_id).into_iter().flatten()
     }
 
-    /// Puts a task where it is found; with no rank it is not ready.
+    /// Puts a task where it is found; with no rank it is not ready. True: it is found elsewhere or by others than before.
     pub(super) fn put_task(
         &mut self,
         task_id: &TaskId,
         rank: Option<&Rank>,
         rows: Option<(&TaskState, &TaskIntake)>,
         find: impl Fn(&crate::ids::WaypointId) -> Option<WaypointIx>,
-    ) {
+    ) -> bool {
         let new = rank.zip(rows).and_then(|(rank, (task, intake))| {
             let from = crate::step::from_step(&intake.spec.steps, task.next_step);
             let need = Need::of_intake(intake);
             let need = self.by_need.get_key_value(&need).map_or_else(|| Arc::new(need), |(known, _)| known.clone());
-            let bound_to = task.opened_robot_id.as_ref().or(intake.spec.robot_id.as_ref()).cloned();
+            let bound_to = task.opened_robot_id.as_ref().or(task.pinned_robot(intake)).cloned();
             // Where the map has lost a goal of it no robot can go.
             let goals: Option<Vec<WaypointIx>> = intake.spec.goals(from as usize).map(find).collect();
             Some(ReadyTask { rank: rank.clone(), bound_to, need, goal: goals?.first().copied() })
         });
         if self.tasks.get(task_id) == new.as_ref() {
-            return;
+            return false;
         }
         if let Some(old) = self.tasks.remove(task_id) {
             self.take_out(&old);
         }
-        let Some(new) = new else { return };
+        let Some(new) = new else { return true };
         match &new.bound_to {
             Some(robot_id) => self.by_robot.entry(robot_id.clone()).or_default().insert(new.rank.clone()),
             None => {
@@ -103,6 +103,7 @@ impl ReadyTasks {
             }
         };
         self.tasks.insert(task_id.clone(), new);
+        true
     }
 
     fn take_out(&mut self, old: &ReadyTask) {

@@ -93,7 +93,7 @@ pub(in crate::fleet) fn another_could(
 /// Whether the task itself leaves the robot out, whatever it can do.
 pub(in crate::fleet) fn bound(robot_id: &RobotId, task: &TaskState, intake: &TaskIntake) -> Result<(), Reason> {
     let spec = &intake.spec;
-    if spec.robot_id.as_ref().is_some_and(|r| r != robot_id) {
+    if task.pinned_robot(intake).is_some_and(|r| r != robot_id) {
         return Err(Code::RobotPinnedElsewhere.into());
     }
     if task.opened_robot_id.as_ref().is_some_and(|r| r != robot_id) {

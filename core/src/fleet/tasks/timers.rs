@@ -35,7 +35,7 @@ pub fn due(view: &FleetProjection, now: &Now) -> (Vec<Timer>, Vec<TaskId>) {
 pub(in crate::fleet) fn is_late(view: &FleetProjection, task_id: &TaskId, now: &Now) -> bool {
     let Some((task, intake)) = view.task(task_id).zip(view.intake(task_id)) else { return false };
     let ends = task.phase.is_terminal() || matches!(task.then, Some(AfterStopping::Expired | AfterStopping::Canceled));
-    let passed = intake.spec.deadline.is_some_and(|deadline| deadline <= now.utc);
+    let passed = task.deadline(intake).is_some_and(|deadline| deadline <= now.utc);
     passed && !ends && task.phase != Phase::NeedsOperator
 }
 

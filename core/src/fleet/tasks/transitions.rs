@@ -99,6 +99,15 @@ pub fn is_held(tx: &Tx, task: &TaskState) -> bool {
     !task.holds.is_empty() || task.robot_id.as_ref().is_some_and(|r| tx.view.robot_holds(r).next().is_some())
 }
 
+/// Tells a task that the last token went, if none of its own or of its robot stands. False: one stands.
+pub fn go_on_unless_held(tx: &mut Tx, task: &TaskState) -> bool {
+    let is_free = !is_held(tx, task);
+    if is_free {
+        apply_event(tx, &task.task_id, News::from_event(Event::LastHoldGone, None));
+    }
+    is_free
+}
+
 /// The attempt's new phase after `event`, if the event says one.
 fn phase_of(event: Event, report: Option<&AttemptReport>) -> Option<AttemptPhase> {
     Some(match (event, report.map(|r| r.state)) {

@@ -2,6 +2,7 @@
 
 mod arrivals;
 mod backlog;
+mod changes;
 mod closed_places;
 mod drains;
 mod energy;

@@ -70,7 +70,8 @@ pub(super) fn bars_passage(view: &FleetProjection, robot_id: &RobotId) -> bool {
 }
 
 fn class_of(view: &FleetProjection, a: &Attempt) -> Class {
-    let priority = a.attempt.subject.task_id().and_then(|t| view.intake(t)).map_or(9, |i| i.spec.priority);
+    let rows = a.attempt.subject.task_id().and_then(|t| view.task(t).zip(view.intake(t)));
+    let priority = rows.map_or(9, |(task, intake)| task.priority(intake));
     Class::from_priority(priority, 0)
 }
 

@@ -28,20 +28,6 @@ const BY_TIME: [Event; 8] = [
     Event::ScheduleToStart,
 ];
 
-const NO_FACTS: Facts = Facts {
-    retries_left: false,
-    retry_wanted: false,
-    drops_left: false,
-    opened: false,
-    begun_repeatable: false,
-    refusals_spent: false,
-    refused_by_all: false,
-    semantic: false,
-    elsewhere: false,
-    held: false,
-    accepted: false,
-};
-
 fn all_facts() -> impl Iterator<Item = Facts> {
     (0..2048_u32).map(|bits| {
         let bit = |n: u32| bits & (1 << n) != 0;
@@ -107,7 +93,7 @@ fn standing_named(name: &str) -> MachineState {
 }
 
 fn facts_named(names: &str) -> Facts {
-    let mut f = NO_FACTS;
+    let mut f = Facts::default();
     for name in names.split(',').filter(|n| *n != "-") {
         match name {
             "retries_left" => f.retries_left = true,
@@ -309,7 +295,7 @@ fn a_wish_that_stands_is_answered_whatever_the_robot_reports() {
             }
         }
         for event in [Event::Accepted, Event::Progress, Event::SeenRunning] {
-            let back = next(at(phase, true), event, &NO_FACTS);
+            let back = next(at(phase, true), event, &Facts::default());
             let stops =
                 Next { phase: Phase::Stopping, then: Some(AfterStopping::Canceled), action: AttemptAction::Known };
             assert_eq!(back, Some(stops), "{event:?}");
@@ -320,7 +306,7 @@ fn a_wish_that_stands_is_answered_whatever_the_robot_reports() {
 #[test]
 fn a_person_can_end_every_task_that_has_not_ended() {
     for at in reachable().filter(|s| !s.phase.is_terminal()) {
-        let after = next(at, Event::CancelForce, &NO_FACTS).map(|n| n.phase);
+        let after = next(at, Event::CancelForce, &Facts::default()).map(|n| n.phase);
         assert_eq!(after, Some(Phase::Canceled), "{}", shown(at));
     }
 }

@@ -2,6 +2,7 @@
 
 mod asks;
 mod batch;
+mod changes;
 #[path = "../../../../tests/src/counted.rs"]
 mod counted;
 mod errors;

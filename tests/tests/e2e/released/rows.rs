@@ -93,7 +93,7 @@ macro_rules! records {
 records! {
     TaskIntake task::TaskIntake;
     TaskRequest task::TaskRequest;
-    RequestKey task::state::RequestKey;
+    RequestKey task::requests::RequestKey;
     TaskState task::TaskState;
     Attempt task::Attempt;
     Timer fleet::rows::Timer;

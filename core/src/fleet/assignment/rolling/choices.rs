@@ -253,7 +253,7 @@ impl<'a> Finder<'a> {
         let Some(way_mm) = way_mm(view, *at, ready.goal).filter(|_| is_fit) else { return false };
         let nth = *looked.nth.get_or_insert_with(|| {
             let Rank { class, since, .. } = ready.rank;
-            self.found.urgencies.push(Urgency { class, since, deadline: intake.spec.deadline });
+            self.found.urgencies.push(Urgency { class, since, deadline: task.deadline(intake) });
             self.found.tasks.push(task_id.clone());
             self.found.tasks.len() - 1
         });
