@@ -62,9 +62,10 @@ impl TaskEdit {
             ("deadline", self.deadline.map(time)),
             ("robot_id", self.robot_id.as_ref().map(robot)),
         ];
-        changed.into_iter().filter_map(|(name, value)| Some((name, value?))).fold(note, |note, (name, value)| {
-            note.with(name, value)
-        })
+        changed
+            .into_iter()
+            .filter_map(|(name, value)| Some((name, value?)))
+            .fold(note, |note, (name, value)| note.with(name, value))
     }
 }
 

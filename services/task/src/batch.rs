@@ -123,7 +123,7 @@ impl<'a> Batch<'a> {
             let outcome = outcome.inspect_err(|refusal| self.reporter.report(refusal));
             let notes = match &outcome {
                 // The task is durable, whether or not the rows of its robot can be read now.
-                Ok(Durable::New(intake)) => self.service.notes(&intake.spec).await.unwrap_or_default(),
+                Ok(Durable::New(intake)) => self.service.notes(&intake.spec.robot_id).await.unwrap_or_default(),
                 Ok(Durable::Known(_)) | Err(_) => Vec::new(),
             };
             self.results.push(result_of(request_id, outcome, &notes));

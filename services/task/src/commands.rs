@@ -1,5 +1,5 @@
-//! What people ask of admitted tasks: cancel, resolve; `resume` and `task_changes` are rooms of their own. The request is made durable; fleet obeys it; we wait a
-//! little and show the task.
+//! What people ask of admitted tasks: cancel, resolve; `resume` and `task_changes` are rooms of their own. The request is
+//! made durable; fleet obeys it; we wait a little and show the task.
 //!
 //! Invariant: whether fleet has looked at a request is read from fleet's own mark, never guessed from how a task looks. A repeat of a
 //! request_id with the same body is the same request: it writes nothing and its etag is not asked for again.

@@ -135,12 +135,7 @@ impl TaskService {
 }
 
 /// What every change names.
-fn read_common(
-    task_id: &str,
-    reason: &str,
-    own_id: &str,
-    bad: &mut Violations,
-) -> (Option<TaskId>, Option<RequestId>) {
+fn read_common(task_id: &str, reason: &str, own_id: &str, bad: &mut Violations) -> (Option<TaskId>, Option<RequestId>) {
     let task_id = bad.accept("task_id", TaskId::parse(task_id));
     reason_text(reason, bad);
     (task_id, request_id(own_id, bad))

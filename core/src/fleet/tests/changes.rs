@@ -43,8 +43,7 @@ impl Rig {
     fn ask(&mut self, ask: Ask) -> Option<Code> {
         let seq = Seq(self.view.marks.get("fleet").map_or(0, |mark| mark.row.seq.0) + 1);
         let (reason, actor) = ("the aisle is wet".to_owned(), "anna".to_owned());
-        let request =
-            TaskRequest { id: format!("ask-{}", seq.0), ask, reason, actor, at_unix_ms: self.now.wall.0 };
+        let request = TaskRequest { id: format!("ask-{}", seq.0), ask, reason, actor, at_unix_ms: self.now.wall.0 };
         let entry = Entry {
             seq,
             log: Log::Task,
@@ -370,7 +369,10 @@ fn a_deadline_passes_although_a_person_holds_the_task() {
     rig.hold("T1");
     rig.pass(60 * MINUTE_MS);
     rig.cycle(Pace::Sweep);
-    assert_eq!((rig.task("T1").phase, rig.task("T1").then), (Phase::Stopping, Some(crate::task::AfterStopping::Expired)));
+    assert_eq!(
+        (rig.task("T1").phase, rig.task("T1").then),
+        (Phase::Stopping, Some(crate::task::AfterStopping::Expired))
+    );
 }
 
 #[test]
@@ -416,7 +418,10 @@ fn a_row_keeps_the_answers_to_the_newest_requests_alone() {
         rig.ask(edit("T1", priority(n % 10)));
     }
     let answers: Vec<&str> = rig.task("T1").answers.iter().map(|answer| answer.request.as_str()).collect();
-    assert_eq!((answers.len(), answers.first(), answers.last()), (limits::ANSWERS_OF_TASK, Some(&"ask-4"), Some(&"ask-11")));
+    assert_eq!(
+        (answers.len(), answers.first(), answers.last()),
+        (limits::ANSWERS_OF_TASK, Some(&"ask-4"), Some(&"ask-11"))
+    );
 }
 
 #[test]

@@ -40,10 +40,7 @@ async fn call(world: &World, request: UpdateTaskRequest) -> Result<v1::UpdateTas
     Ok(world.service.update_task(local(request)).await?.into_inner())
 }
 
-async fn call_while_fleet_works(
-    world: &World,
-    request: UpdateTaskRequest,
-) -> Result<v1::UpdateTaskResponse, Status> {
+async fn call_while_fleet_works(world: &World, request: UpdateTaskRequest) -> Result<v1::UpdateTaskResponse, Status> {
     let head = world.head();
     tokio::join!(call(world, request), world.fleet_turns_after(head)).0
 }
@@ -214,10 +211,9 @@ async fn an_edit_whose_task_ended_first_is_refused_and_one_that_is_forgotten_is_
 #[tokio::test(start_paused = true)]
 async fn a_task_that_a_person_holds_says_who_and_why_and_goes_on_when_it_is_released() {
     let world = World::new().await;
-    for (at_work, held, free) in [
-        (false, v1::TaskState::Queued, v1::TaskState::Queued),
-        (true, v1::TaskState::Held, v1::TaskState::Running),
-    ] {
+    for (at_work, held, free) in
+        [(false, v1::TaskState::Queued, v1::TaskState::Queued), (true, v1::TaskState::Held, v1::TaskState::Running)]
+    {
         let task_id = queued(&world).await;
         if at_work {
             world.runs(&task_id, 1).await;
@@ -226,7 +222,10 @@ async fn a_task_that_a_person_holds_says_who_and_why_and_goes_on_when_it_is_rele
         let call = async { world.service.hold_task(local(hold(&task_id))).await.expect("held").into_inner() };
         let (answer, ()) = tokio::join!(call, world.fleet_turns_after(head));
         let task = answer.task.expect("always set");
-        assert_eq!((answer.pending, task.state(), task.hold_tokens.as_slice()), (false, held, &["operator".into()][..]));
+        assert_eq!(
+            (answer.pending, task.state(), task.hold_tokens.as_slice()),
+            (false, held, &["operator".into()][..])
+        );
         let hold = task.operator_hold.expect("a person holds it");
         assert_eq!((hold.actor.as_str(), hold.reason.as_str()), ("local", "the aisle is wet"));
         assert_eq!(task.reason.expect("a reason").code, "HOLD_BY_PERSON");
@@ -267,9 +266,7 @@ async fn a_person_changes_and_holds_tasks_of_its_own_areas_alone() {
     let operator = anna(&["operator@hall", "viewer@quality"]);
     let blind = anna(&["operator@hall"]);
     let code = |result: Result<_, Status>| result.map_or_else(|refused| refused.code(), |()| Code::Ok);
-    let change = async |by: &Caller, id: &str| {
-        code(world.service.update_task(asked(by, urgent(id))).await.map(drop))
-    };
+    let change = async |by: &Caller, id: &str| code(world.service.update_task(asked(by, urgent(id))).await.map(drop));
     let stand = async |by: &Caller, id: &str| {
         let held = code(world.service.hold_task(asked(by, hold(id))).await.map(drop));
         let released = code(world.service.release_task(asked(by, release(id))).await.map(drop));

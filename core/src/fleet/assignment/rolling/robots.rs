@@ -16,7 +16,7 @@ use crate::step::StepKind;
 use crate::task::machine::AfterStopping;
 use crate::task::spec::Class;
 use crate::task::state::Errand;
-use crate::task::{Attempt, AttemptPhase, TaskIntake};
+use crate::task::{Attempt, AttemptPhase};
 use crate::time::Now;
 
 /// Robots that are weighed against all tasks at once. Of more of them each task looks for the nearest.
@@ -105,9 +105,9 @@ pub fn find_stopping(view: &FleetProjection, board: &Board, now: &Now) -> Vec<Ro
 pub fn find_interruptible(view: &FleetProjection, board: &Board, now: &Now) -> Vec<(TaskId, Robot)> {
     let robot = |(robot_id, attempt): (&RobotId, &AttemptId)| {
         let (task_id, live) = (attempt.subject.task_id()?, board.get(robot_id)?);
-        let is_urgent = |task: &TaskIntake| Class::from_priority(task.spec.priority, 0) == Class::Urgent;
-        let is_certain = view.attempt(attempt)?.uncertain.is_none();
-        if view.intake(task_id).is_none_or(is_urgent) || !is_certain || !may_suspend(view, task_id, live) {
+        let (task, intake) = view.task(task_id).zip(view.intake(task_id))?;
+        let is_urgent = Class::from_priority(task.priority(intake), 0) == Class::Urgent;
+        if is_urgent || view.attempt(attempt)?.uncertain.is_some() || !may_suspend(view, task_id, live) {
             return None;
         }
         filters::in_work(view, board, robot_id, now).ok()?;
