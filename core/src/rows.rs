@@ -61,7 +61,7 @@ macro_rules! tables {
 
 tables! {
     TaskIntake "task_intake" Task, "What was asked for: immutable. id = task_id, order = admission number.";
-    TaskRequest "task_request" Task, "What people ask of a task or robot afterwards (cancel, resolve, resume): append-only, kept 30 days.";
+    TaskRequest "task_request" Task, "What people ask of a task or robot afterwards (cancel, resolve, edit, hold, release, resume): append-only, kept 30 days.";
     RequestKey "request_key" Task, "request_id -> payload hash and answer; kept 7 days.";
     TaskState "task_state" Fleet, "Where a task is. Born QUEUED with its intake. state = phase.";
     Attempt "attempt" Fleet, "One grant of a task or errand to one robot. id = subject/epoch, parent = subject.";

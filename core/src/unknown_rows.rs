@@ -138,7 +138,7 @@ mod tests {
             rows.keep_aside(&row, &error.expect("a word of a newer version"));
         };
         let (mut before, mut next) = (UnknownRows::default(), UnknownRows::default());
-        aside(&mut before, Table::TaskRequest, r#"{"ask":{"hold":{"task_ids":["T1"]}}}"#);
+        aside(&mut before, Table::TaskRequest, r#"{"ask":{"lend":{"task_ids":["T1"]}}}"#);
         aside(&mut before, Table::TaskState, "{}");
         next.carry_requests(&mut before);
         let is_aside = |id: &str| next.of_task(&TaskId::parse(id).expect("an id")).is_some();

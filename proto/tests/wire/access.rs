@@ -112,6 +112,8 @@ fn what_nobody_should_have_to_look_up_is_as_it_was_said() {
         ("/midshift.ota.v1.BundleService/PublishRepository", &["ota-author"]),
         ("/midshift.task.v1.TaskService/SubmitTasks", &["dispatcher", "operator"]),
         ("/midshift.task.v1.TaskService/ResumeHeld", &["operator"]),
+        ("/midshift.task.v1.TaskService/UpdateTask", &["dispatcher", "operator"]),
+        ("/midshift.task.v1.TaskService/HoldTask", &["operator"]),
         ("/midshift.task.v1.TaskService/CancelTasks", &["dispatcher", "operator"]),
         ("/midshift.task.v1.TaskService/ResolveTasks", &["operator"]),
         ("/midshift.fleet.v1.FleetService/PutAreaPolicy", &["operator"]),
