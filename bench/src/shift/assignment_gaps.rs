@@ -55,7 +55,7 @@ impl AssignmentWatch {
     ///
     /// # Errors
     /// The planner does not answer.
-    pub async fn look(&mut self, plane: &ControlPlane, now_ms: u64) -> anyhow::Result<()> {
+    pub async fn look_for_gaps(&mut self, plane: &ControlPlane, now_ms: u64) -> anyhow::Result<()> {
         let since_look_ms = now_ms - std::mem::replace(&mut self.looked_ms, now_ms);
         if plane.is_planner_away() {
             // Nobody names anything.

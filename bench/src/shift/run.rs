@@ -184,7 +184,7 @@ async fn play(config: &ShiftConfig) -> anyhow::Result<Outcome> {
             ended = &mut answering => ended?,
             failed = plane.await_failure() => return Err(failed),
             Some(_) = robots.join_next() => bail!("a robot ended by itself"),
-            () = tokio::time::sleep(LOOK) => watches.look(&mut plane).await?,
+            () = tokio::time::sleep(LOOK) => watches.look_around(&mut plane).await?,
         }
     }
     // Before anything is explained: a question is a turn of the planner.

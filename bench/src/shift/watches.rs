@@ -24,7 +24,7 @@ const WARM_UP: Duration = Duration::from_secs(600);
 /// What is watched for.
 #[derive(Clone)]
 pub struct WatchConfig {
-    /// Where.
+    /// The site that is watched.
     pub site: Arc<Site>,
     /// What goes wrong.
     pub scenario: Scenario,
@@ -78,7 +78,7 @@ impl Batteries {
 pub struct Totals {
     /// That moment, milliseconds since the beginning.
     pub at_ms: u64,
-    /// Tasks.
+    /// Tasks until then.
     pub counts: TaskCounts,
     /// What was planned.
     pub plans: PlansNoted,
@@ -138,7 +138,7 @@ impl Watches {
     ///
     /// # Errors
     /// The planner fails, or a journal cannot be read.
-    pub async fn look(&mut self, plane: &mut ControlPlane) -> anyhow::Result<()> {
+    pub async fn look_around(&mut self, plane: &mut ControlPlane) -> anyhow::Result<()> {
         let (now, now_ms, scenario) = (self.clock.now().site, self.clock.elapsed_ms(), &self.config.scenario);
         let batteries = scenario.charging.map(|_| Batteries::read(&self.fleet, now)).unwrap_or_default();
         self.samples.push(Sample { at_ms: now_ms, counts: self.records.counts(), batteries });
@@ -151,7 +151,7 @@ impl Watches {
             }
         }
         if let Some(assignments) = &mut self.assignments {
-            assignments.look(plane, now_ms).await?;
+            assignments.look_for_gaps(plane, now_ms).await?;
         }
         if scenario.losses == Losses::Two {
             self.lost_robots.look_at_robots(plane, now).await?;

@@ -54,7 +54,7 @@ struct Changes {
 pub struct Stand {
     #[command(flatten)]
     one: TaskTarget,
-    /// Why.
+    /// Why it is to stand or to go on.
     #[arg(long)]
     reason: String,
     #[command(flatten)]

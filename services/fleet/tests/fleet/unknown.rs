@@ -113,7 +113,7 @@ async fn a_task_of_which_a_newer_version_asks_something_is_left_alone_and_a_pers
     w.submit("T1", "A", "B").await;
     w.submit("T2", "A", "B").await;
     w.pass(1).await;
-    let body = r#"{"id":"q1","ask":{"hold":{"task_id":"T1"}},"reason":"wait","actor":"anna","at_unix_ms":1}"#;
+    let body = r#"{"id":"q1","ask":{"lend":{"task_id":"T1"}},"reason":"wait","actor":"anna","at_unix_ms":1}"#;
     let write = Write::Put { index: Index::default(), body: body.into() };
     let mut item = Item::new(Writer::Task, "tests");
     let key = Key::new(Table::TaskRequest, "q1");

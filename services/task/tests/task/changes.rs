@@ -227,7 +227,7 @@ async fn a_task_that_a_person_holds_says_who_and_why_and_goes_on_when_it_is_rele
             (false, held, &["operator".into()][..])
         );
         let hold = task.operator_hold.expect("a person holds it");
-        assert_eq!((hold.actor.as_str(), hold.reason.as_str()), ("local", "the aisle is wet"));
+        assert_eq!((hold.actor.as_str(), hold.reason.as_str()), ("anonymous", "the aisle is wet"));
         assert_eq!(task.reason.expect("a reason").code, "HOLD_BY_PERSON");
         let head = world.head();
         let call = async { world.service.release_task(local(release(&task_id))).await.expect("free").into_inner() };
