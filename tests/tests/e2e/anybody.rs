@@ -90,6 +90,8 @@ fn filled(of: &MessageDescriptor, words: &Words, deep: u32) -> (Map<String, Valu
 fn value(field: &FieldDescriptor, words: &Words, deep: u32) -> Option<(Value, usize)> {
     let (value, found) = match (words.get(field.name()), field.kind()) {
         (Some(Value::Null), _) => return None,
+        // A mask is written as one word.
+        (Some(word), Kind::Message(of)) if of.full_name() == "google.protobuf.FieldMask" => (word.clone(), 1),
         (Some(word), kind) if !matches!(kind, Kind::Message(_)) => (word.clone(), 1),
         (_, Kind::Message(of)) if deep > 0 && !field.is_map() && !of.full_name().starts_with("google.") => {
             let (fields, found) = filled(&of, words, deep - 1);

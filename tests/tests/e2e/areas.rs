@@ -45,7 +45,13 @@ fn words(nth: usize, incident: &str, stop: &str) -> Words {
         words.insert(name, words[of].clone());
     }
     // What else must be there. Nobody has seen that etag, and nothing is done that can be looked at instead.
-    let with = [("etag", "999999"), ("reason", "a look"), ("bundle", BUNDLE), ("new_rollout_id", "r-new")];
+    let with = [
+        ("etag", "999999"),
+        ("update_mask", "priority"),
+        ("reason", "a look"),
+        ("bundle", BUNDLE),
+        ("new_rollout_id", "r-new"),
+    ];
     words.extend(with.map(|(name, word)| (name, json!(word))));
     words.extend([("task_type", json!("transport")), ("timeout_seconds", json!(60)), ("validate_only", json!(true))]);
     words.extend([("resolution", json!(1)), ("request_id", json!("q-1"))]);
