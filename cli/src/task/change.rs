@@ -1,6 +1,7 @@
 //! `midshift task edit|hold|release`: what people change of a task while it waits, and tasks that stand until they are let go.
 
 use super::shown::show;
+use super::submit::robot_is_known;
 use super::target::TaskTarget;
 use crate::client::{Change, Exit, Guarded, unary};
 use crate::out::{Out, plain};
@@ -15,6 +16,9 @@ pub struct Edit {
     one: TaskTarget,
     #[command(flatten)]
     changes: Changes,
+    /// Also if nobody knows the robot: the task waits until it comes.
+    #[arg(long)]
+    unknown_robot: bool,
     /// Why it changes.
     #[arg(long)]
     reason: String,
@@ -87,7 +91,7 @@ impl Changes {
 
 /// Changes a task.
 pub async fn edit(args: Edit, out: &Out) -> Result<(), Exit> {
-    let Edit { one, changes, reason, guarded: Guarded { if_match, change } } = args;
+    let Edit { one, changes, unknown_robot, reason, guarded: Guarded { if_match, change } } = args;
     let task_id = one.find().await?;
     let (mask, update) = changes.into_update();
     let request = v1::UpdateTaskRequest {
@@ -99,6 +103,11 @@ pub async fn edit(args: Edit, out: &Out) -> Result<(), Exit> {
         reason,
         validate_only: change.dry_run,
     };
+    let robot = request.update.as_ref().map_or("", |update| &update.robot_id);
+    if !robot.is_empty() && !unknown_robot {
+        let check = v1::UpdateTaskRequest { validate_only: true, ..request.clone() };
+        robot_is_known(robot, &one.call.task().await?.update_task(unary(check)).await?.into_inner().notes)?;
+    }
     let answer = one.call.task().await?.update_task(unary(request)).await?.into_inner();
     show(&answer.task.unwrap_or_default(), out)?;
     answer.notes.iter().for_each(|note| out.inform(&format!("{}: {}", note.code, plain(&note.message))));

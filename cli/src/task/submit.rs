@@ -8,6 +8,7 @@ use crate::site_file;
 use crate::task_list::{read_list, request};
 use indicatif::{ProgressBar, ProgressStyle};
 use midshift_core::task::forms::Transport;
+use midshift_proto::common::v1::Reason;
 use midshift_proto::task::v1;
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -116,10 +117,18 @@ async fn robots_are_known(args: &Submit, tasks: impl IntoIterator<Item = &v1::Su
     for (robot, task) in pinned {
         let check = v1::SubmitTaskRequest { validate_only: true, ..task.clone() };
         let notes = client.submit_task(unary(check)).await?.into_inner().notes;
-        if notes.iter().any(|note| note.code == midshift_core::reason::Code::PinnedRobotUnknown.as_str()) {
-            let text = format!("nobody knows a robot {robot}: it is not enrolled and has never connected");
-            return Err(Exit::new(4, text).or_try("midshift robot ls, or --unknown-robot to submit it all the same"));
-        }
+        robot_is_known(&robot, &notes)?;
+    }
+    Ok(())
+}
+
+/// Refuses to bind a task to a robot of which the server's notes say that nobody knows it.
+pub(super) fn robot_is_known(robot: &str, notes: &[Reason]) -> Result<(), Exit> {
+    if notes.iter().any(|note| note.code == midshift_core::reason::Code::PinnedRobotUnknown.as_str()) {
+        let text = format!("nobody knows a robot {robot}: it is not enrolled and has never connected");
+        return Err(
+            Exit::new(4, text).or_try("midshift robot ls, or --unknown-robot to bind the task to it all the same")
+        );
     }
     Ok(())
 }

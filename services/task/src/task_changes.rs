@@ -58,42 +58,38 @@ impl TaskService {
 
     /// Puts a person's hold on a task.
     pub async fn hold(&self, r: v1::HoldTaskRequest, by: &Caller) -> Result<v1::HoldTaskResponse, Refusal> {
-        let mut bad = Violations::default();
-        let (task_id, request_id) = read_common(&r.task_id, &r.reason, &r.request_id, &mut bad);
-        bad.finish()?;
-        let task_id = task_id.ok_or_else(internal)?;
-        let same = v1::HoldTaskRequest { request_id: String::new(), validate_only: false, ..r.clone() };
-        let wanted = Wanted {
-            ask: Ask::Hold { task_id: task_id.clone() },
-            task_id,
-            reason: r.reason,
-            request_id,
-            hash: hash("hold", &same),
-            permission: Permission::Operate,
-            validate_only: r.validate_only,
-        };
-        let Changed { task, pending } = self.change(wanted, by).await?;
+        let hash = hash("hold", &v1::HoldTaskRequest { request_id: String::new(), validate_only: false, ..r.clone() });
+        let named = (r.task_id, r.request_id, r.reason);
+        let Changed { task, pending } =
+            self.let_stand(|task_id| Ask::Hold { task_id }, named, hash, r.validate_only, by).await?;
         Ok(v1::HoldTaskResponse { task: Some(task), pending })
     }
 
     /// Takes a person's hold away.
     pub async fn release(&self, r: v1::ReleaseTaskRequest, by: &Caller) -> Result<v1::ReleaseTaskResponse, Refusal> {
+        let same = v1::ReleaseTaskRequest { request_id: String::new(), validate_only: false, ..r.clone() };
+        let named = (r.task_id, r.request_id, r.reason);
+        let Changed { task, pending } = self
+            .let_stand(|task_id| Ask::Release { task_id }, named, hash("release", &same), r.validate_only, by)
+            .await?;
+        Ok(v1::ReleaseTaskResponse { task: Some(task), pending })
+    }
+
+    /// Asks for a hold or its end, of the task, by the request_id and for the reason that the caller named.
+    async fn let_stand(
+        &self,
+        ask: impl Fn(TaskId) -> Ask,
+        (task_id, request_id, reason): (String, String, String),
+        hash: String,
+        validate_only: bool,
+        by: &Caller,
+    ) -> Result<Changed, Refusal> {
         let mut bad = Violations::default();
-        let (task_id, request_id) = read_common(&r.task_id, &r.reason, &r.request_id, &mut bad);
+        let (task_id, request_id) = read_common(&task_id, &reason, &request_id, &mut bad);
         bad.finish()?;
         let task_id = task_id.ok_or_else(internal)?;
-        let same = v1::ReleaseTaskRequest { request_id: String::new(), validate_only: false, ..r.clone() };
-        let wanted = Wanted {
-            ask: Ask::Release { task_id: task_id.clone() },
-            task_id,
-            reason: r.reason,
-            request_id,
-            hash: hash("release", &same),
-            permission: Permission::Operate,
-            validate_only: r.validate_only,
-        };
-        let Changed { task, pending } = self.change(wanted, by).await?;
-        Ok(v1::ReleaseTaskResponse { task: Some(task), pending })
+        let (ask, permission) = (ask(task_id.clone()), Permission::Operate);
+        self.change(Wanted { ask, task_id, reason, request_id, hash, permission, validate_only }, by).await
     }
 
     async fn change(&self, wanted: Wanted, by: &Caller) -> Result<Changed, Refusal> {

@@ -213,6 +213,12 @@ fn for_people(t: &mut Transcript) -> anyhow::Result<()> {
     t.note(&["task", "submit", "--from", "A", "--to", "B", "--sku", "SKU-5", "--task-id", "TASK-5"])?;
     t.note(&["task", "submit", "--from", "A", "--to", "B", "--dry-run"])?;
     t.note(&["task", "ls", "--limit", "1"])?;
+    t.note(&["task", "edit", "TASK-5", "--priority", "2", "--reason", "the lorry waits"])?;
+    t.note(&["task", "edit", "TASK-5", "--robot", "r9", "--reason", "it is free"])?;
+    t.note(&["task", "hold", "TASK-5", "--reason", "the aisle is wet"])?;
+    t.note(&["task", "explain", "TASK-5"])?;
+    t.note(&["task", "release", "TASK-5", "--reason", "it is dry"])?;
+    t.note(&["task", "get", "TASK-5"])?;
     t.note(&["task", "resume", "--robot", "r1", "--reason", "all clear"])?;
     t.note(&["task", "cancel", "TASK-5", "--reason", "not wanted", "-o", "name"])?;
     Ok(())

@@ -74,8 +74,9 @@ fn queued(view: &FleetProjection, board: &Board, now: &Now, task: &TaskState, in
         return Some(Reason::from(Code::WaitingForRobot).with(WAITS_FOR, told));
     };
     let what = match Wait::of_task(task, intake, &view.ended, now.utc) {
+        // What a person can end is told before what passes by itself.
+        _ if task.held_by_person().is_some() => return held_by_person(task),
         Wait::Time(at) => at.rfc3339(),
-        Wait::Hold(_) if task.held_by_person().is_some() => return held_by_person(task),
         Wait::Hold(token) => return Some(held(why.code, &token)),
         Wait::Dependency(id) | Wait::Failed(id) => format!("task {id}"),
         Wait::Turn(_) | Wait::Mark => task.robot_id.as_ref().map(|r| format!("robot {r}")).unwrap_or_default(),

@@ -313,6 +313,7 @@ fn a_queued_task_that_a_person_holds_goes_to_no_robot_until_it_is_released() {
     rig.submit("T1", |_| {});
     rig.submit("later", |raw| raw.not_before = Some(BEGIN.plus_ms(MINUTE_MS)));
     assert_eq!((rig.hold("T1"), rig.hold("later")), (None, None));
+    assert_eq!(rig.why(&id("later")).map(|why| why.code), Some(Code::HoldByPerson), "although its time has not come");
     rig.pass(2 * MINUTE_MS);
     let mut rebuilt = rig.rebuilt();
     for rig in [&mut rig, &mut rebuilt] {

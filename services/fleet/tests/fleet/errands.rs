@@ -64,6 +64,22 @@ async fn a_task_that_is_not_preemptible_or_is_opened_goes_on_with_little_charge(
 }
 
 #[tokio::test(start_paused = true)]
+async fn an_urgent_task_is_done_first_by_the_robot_of_one_that_may_be_interrupted() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-b").await;
+    w.submit_with("T1", "A", "B", |raw| raw.preemptible = true).await;
+    w.until("it is on its way", |s| s.phase("T1") == Phase::Running && s.has("r1", "corridor")).await;
+    w.submit_with("T2", "A", "B", |raw| raw.priority = Some(0)).await;
+    let seen = w.until("it is suspended", |s| s.phase("T1") != Phase::Running).await;
+    assert_eq!(seen.reason("T1"), Some(Code::UrgentSuspend));
+    let seen = w.until_phase("T2", Phase::Succeeded).await;
+    assert_eq!((seen.phase("T1"), seen.task("T2").epoch), (Phase::Queued, 1));
+    let seen = w.until_phase("T1", Phase::Succeeded).await;
+    assert_eq!((seen.task("T1").failures, seen.task("T1").epoch), (0, 2), "no failure, and a second grant");
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_robot_left_idle_in_a_station_is_sent_to_park() {
     let mut w = World::on(CORRIDOR).await;
     w.robot("r1", "park-a").await;
