@@ -3,6 +3,7 @@
 use super::rolling::{line, visits};
 use super::*;
 use crate::reason::Code;
+use crate::task::spec::Class;
 use crate::task::{AfterStopping, Phase};
 
 /// Goes to `c0` with this priority.
@@ -78,6 +79,19 @@ fn only_an_urgent_task_takes_a_robot() {
     at_work(&mut rig, "r1", 10, "t1", &[90], true);
     rig.submit("normal", visit(5));
     rig.cycle(Pace::Sweep);
+    assert_eq!(give_way(&rig, &["t1"]), Vec::<String>::new());
+}
+
+#[test]
+fn a_task_that_is_urgent_by_waiting_alone_takes_no_robot() {
+    let mut rig = line();
+    at_work(&mut rig, "r1", 10, "t1", &[90], true);
+    rig.submit("old", visit(5));
+    rig.cycle(Pace::Wake);
+    rig.pass(901_000);
+    rig.cycle(Pace::Wake);
+    let rank = rig.view.queue.rank(&TaskId::parse("old").expect("an id")).expect("ready").clone();
+    assert_eq!((rank.class, rank.promoted), (Class::Urgent, true));
     assert_eq!(give_way(&rig, &["t1"]), Vec::<String>::new());
 }
 

@@ -3,6 +3,7 @@
 use super::*;
 use crate::fleet::assignment::errands;
 use crate::fleet::explain;
+use crate::fleet::projection::memory::Meant;
 use crate::rows::Table;
 use crate::site::grid;
 use crate::task::Phase;
@@ -127,17 +128,25 @@ fn a_task_beside_which_another_robot_is_free_soon_waits_for_that_one() {
 
 #[test]
 fn a_task_that_was_meant_for_too_long_and_found_no_robot_is_not_meant_for_one_again_at_once() {
-    let mut rig = one_soon(20);
-    rig.submit("beside", visits(&[101]));
-    rig.cycle(Pace::Wake);
-    // Nobody else could take it.
-    rig.board.remove(&RobotId::parse("idle").expect("an id"));
-    for _ in 0..3 {
-        rig.pass(11_000);
-        rig.cycle(Pace::Wake);
+    let (task_id, robot_id) = (TaskId::parse("beside").expect("an id"), RobotId::parse("soon").expect("an id"));
+    let plan = || vec![(task_id.clone(), robot_id.clone(), BEGIN)];
+    let mut meant = Meant::default();
+    for s in [0, 10, 30] {
+        meant.put_plan(plan(), SiteTime(s * 1_000));
+        assert!(!meant.is_over(&task_id, SiteTime(s * 1_000)), "{s}");
     }
-    rig.robot("idle", "c10");
-    assert_eq!(pairs(&rig.cycle(Pace::Wake)), named(&[("idle", "beside")]));
+    assert!(meant.is_over(&task_id, SiteTime(31_000)));
+    // The plan that leaves it out, and those behind it.
+    for s in [31, 32, 60] {
+        meant.put_plan(Vec::new(), SiteTime(s * 1_000));
+        assert!(meant.get(&task_id).is_none() && meant.is_over(&task_id, SiteTime(s * 1_000)), "{s}");
+    }
+    assert!(!meant.is_over(&task_id, SiteTime(61_000)));
+    // For one that breaks off its errand it is meant at any time, and from then on as if anew.
+    meant.put_plan(plan(), SiteTime(100_000));
+    meant.put_plan(Vec::new(), SiteTime(131_000));
+    meant.put_plan(plan(), SiteTime(132_000));
+    assert!(!meant.is_over(&task_id, SiteTime(162_000)) && meant.is_over(&task_id, SiteTime(163_000)));
 }
 
 #[test]
