@@ -35,8 +35,7 @@ pub struct LossReport {
     pub robots: usize,
     /// Places that a person cleared.
     pub cleared: u64,
-    /// Longest time from the loss of a robot until a place that it held was free, or to the end of the shift; in
-    /// milliseconds.
+    /// Longest time from the loss of a robot until a place that it held was free, or the shift over, milliseconds.
     pub longest_hold_ms: u64,
     /// The same of passages.
     pub longest_passage_hold_ms: u64,
@@ -45,8 +44,7 @@ pub struct LossReport {
 struct LostRobot {
     robot_id: RobotId,
     since: SiteTime,
-    /// Ids of the places that it held when it was lost and holds still, also once it is heard again. None: not asked
-    /// yet.
+    /// Ids of the places that it held when it was lost and holds still, heard again or not. None: not asked yet.
     held: Option<BTreeSet<String>>,
 }
 

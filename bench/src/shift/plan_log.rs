@@ -60,8 +60,7 @@ pub struct PlanLog {
 pub struct PlannerPace {
     /// Each turn takes so long, and the planner rests as long after it, so that news gather.
     pub turn: Duration,
-    /// It is told at most once in so long that something was written; zero: at once. Longer than a sweep changes
-    /// nothing.
+    /// It is told at most once in so long that something was written; zero: at once. At most a sweep matters.
     pub pause: Duration,
 }
 

@@ -293,7 +293,8 @@ impl Observer {
     }
 
     fn entry(&mut self, entry: &Entry) {
-        let secret = matches!(entry.table, Some(Table::Session | Table::TaskRequest));
+        // Ids of sessions and requests are drawn by the process itself, and a request_id's row names that of its request.
+        let secret = matches!(entry.table, Some(Table::Session | Table::TaskRequest | Table::RequestKey));
         let subject = if secret { "" } else { &*entry.subject };
         let body = entry.body.as_deref().filter(|_| !secret).unwrap_or_default();
         let line = format!("{} {subject} {} {} {body}", self.time.us(), entry.kind, entry.seq.0);
