@@ -4,7 +4,7 @@
 //! 1. Only an urgent task takes, and none that came up by waiting; what gives way is not urgent, `preemptible`, not opened, and its
 //!    robot carries nothing.
 //! 2. The urgent task is begun sooner than by any robot that is free soon, by more than both drives: there, and back.
-//! 3. A task gives way at most once in [`PAUSE`], as far as this process remembers.
+//! 3. A task gives way at most once in `PAUSE`, as far as this process remembers.
 
 use super::robots::{self, Robot};
 use crate::fleet::assignment::demand::Demand;
