@@ -5,6 +5,7 @@ use super::out::{Format, Out, plain};
 use midshift_core::fleet::WAITS_FOR;
 use midshift_core::reason::Code;
 use midshift_proto::common::v1::Reason;
+use midshift_proto::fleet::v1::{PairCost, PlanChoice};
 
 /// The lines of an explanation that say what is done or waited for; `nothing`: in case there is no reason.
 pub fn verdict(reason: Option<&Reason>, nothing: &str) -> String {
@@ -14,6 +15,40 @@ pub fn verdict(reason: Option<&Reason>, nothing: &str) -> String {
         Some(what) => told + &format!("  waits for {}\n", plain(what)),
         None => told,
     }
+}
+
+/// Why a plan chose a robot for a task, and what the next ones would have cost.
+pub fn choice(choice: &PlanChoice) -> String {
+    let robot = plain(&choice.robot_id);
+    let chosen = if choice.given { format!("given to {robot}") } else { format!("meant for {robot}") };
+    let mut text = format!("  {chosen}: {}\n", choice.cost.as_ref().map_or_else(String::new, cost));
+    for next in &choice.next {
+        let took = match next.task_id.as_str() {
+            "" => String::new(),
+            task => format!(", which went with {}", plain(task)),
+        };
+        let cost = next.cost.as_ref().map_or_else(String::new, cost);
+        text += &format!("  next {}: {cost}{took}\n", plain(&next.robot_id));
+    }
+    text
+}
+
+/// A cost in seconds on the way, with the terms that are not 0.
+fn cost(cost: &PairCost) -> String {
+    let seconds = |ms: i64| format!("{:.1} s", ms as f64 / 1_000.0);
+    let terms = [
+        ("until it is free", cost.ready_ms),
+        ("way", cost.way_ms),
+        ("failed it before", cost.failed_ms),
+        ("charge", cost.charge_ms),
+        ("late", cost.lateness_ms),
+        ("waited", cost.age_ms),
+        ("meant for it before", cost.kept_ms),
+    ];
+    let terms = terms.iter().filter(|(_, ms)| *ms != 0).map(|(name, ms)| format!("{name} {}", seconds(*ms)));
+    let terms = terms.collect::<Vec<_>>().join(", ");
+    let total = seconds(cost.total_ms);
+    if terms.is_empty() { total } else { format!("{total} ({terms})") }
 }
 
 /// One code, or all.
@@ -43,6 +78,22 @@ pub fn error(code: Option<&str>, out: &Out) -> Result<(), Exit> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use midshift_proto::fleet::v1::NextRobot;
+
+    #[test]
+    fn a_choice_names_its_terms_and_what_the_next_robots_took() {
+        let way = |way_ms, age_ms| PairCost { total_ms: way_ms + age_ms, way_ms, age_ms, ..PairCost::default() };
+        let next = NextRobot { robot_id: "r2".into(), cost: Some(way(9_000, -1_500)), task_id: "T2".into() };
+        let said = choice(&PlanChoice {
+            robot_id: "r1".into(),
+            given: true,
+            cost: Some(way(12_000, -1_500)),
+            next: vec![next],
+            ..PlanChoice::default()
+        });
+        let told = "  given to r1: 10.5 s (way 12.0 s, waited -1.5 s)\n";
+        assert_eq!(said, told.to_owned() + "  next r2: 7.5 s (way 9.0 s, waited -1.5 s), which went with T2\n");
+    }
 
     #[test]
     fn an_explanation_names_what_is_waited_for_where_something_is() {

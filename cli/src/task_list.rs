@@ -20,6 +20,8 @@ pub fn request(t: &Transport) -> SubmitTaskRequest {
         max_retry_times: small(t.max_retry_times),
         retry_interval_seconds: small(t.retry_interval_ms.map(|ms| ms / 1000)),
         schedule_to_start_seconds: small(t.schedule_to_start_ms.map(|ms| ms / 1000)),
+        same_robot_as: t.same_robot_as.clone(),
+        coalesce_key: t.coalesce_key.clone(),
         ..v1::FlatTask::default()
     };
     SubmitTaskRequest { body: Some(Body::Flat(flat)), ..SubmitTaskRequest::default() }

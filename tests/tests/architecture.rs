@@ -9,6 +9,8 @@ mod circles;
 mod dependencies;
 #[path = "architecture/logs.rs"]
 mod logs;
+#[path = "architecture/metrics.rs"]
+mod metrics;
 #[path = "architecture/newer_words.rs"]
 mod newer_words;
 #[path = "architecture/pages.rs"]

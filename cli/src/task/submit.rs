@@ -35,6 +35,12 @@ pub struct Submit {
     /// Only this robot.
     #[arg(long, default_value = "")]
     robot: String,
+    /// Only the robot that had this task, once that has ended.
+    #[arg(long, default_value = "", conflicts_with = "robot")]
+    same_robot_as: String,
+    /// Of the tasks with one key that no robot has, only the newest stays.
+    #[arg(long, default_value = "")]
+    coalesce_key: String,
     /// Also if nobody knows a robot that a task names: it waits until that robot comes.
     #[arg(long)]
     unknown_robot: bool,
@@ -51,7 +57,7 @@ pub struct Submit {
     #[arg(long, default_value = "")]
     task_id: String,
     /// A list instead: .jsonl, .csv, or .tasks of a grid (then with --map).
-    #[arg(long, conflicts_with_all = ["from", "to", "sku", "wait"])]
+    #[arg(long, conflicts_with_all = ["from", "to", "sku", "same_robot_as", "coalesce_key", "wait"])]
     file: Option<PathBuf>,
     /// The grid map a .tasks list belongs to.
     #[arg(long)]
@@ -79,6 +85,8 @@ pub async fn run(args: Submit, out: &Out) -> Result<(), Exit> {
         max_retry_times: Some(args.retries),
         retry_interval_ms: None,
         schedule_to_start_ms: args.schedule_to_start.and_then(|t| i64::try_from(t.as_millis()).ok()),
+        same_robot_as: args.same_robot_as.clone(),
+        coalesce_key: args.coalesce_key.clone(),
     };
     let mut message = request(&transport);
     message.request_id = args.change.request_id.clone();

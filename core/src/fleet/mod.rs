@@ -34,6 +34,7 @@ pub use decision::report::{Report, Tally, WAITS_FOR};
 pub use decision::slice::Slice;
 pub use decision::{incidents, refusals};
 pub use explanation::explain;
+pub use explanation::figures::FleetFigures;
 pub use facts::feed::{
     CLONE_SEEN, LOGS, NOT_ENROLLED_SEEN, NOT_UNDERSTOOD_SEEN, REPORT_TOO_LONG, absorb, follow_rows, obeyed, put_right,
     reread,
@@ -165,7 +166,7 @@ pub fn cycle(view: &mut FleetProjection, now: Now, board: &Board, pace: Pace, pl
     if !plan.items.is_empty() {
         tell_time(view, now, plan);
     }
-    view.forget_ended();
+    plan.report.ended.extend(view.forget_ended());
 }
 
 /// Robots that are new get their rows.

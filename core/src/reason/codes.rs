@@ -216,7 +216,7 @@ codes! {
     BoundElsewhere = "BOUND_ELSEWHERE", "The task is opened: its item is on another robot.";
     // --- why a task waits or ended
     WaitingForRobot = "WAITING_FOR_ROBOT", "No robot passes all filters now.";
-    WaitingForDependency = "WAITING_FOR_DEPENDENCY", "A task it depends on has not succeeded yet.";
+    WaitingForDependency = "WAITING_FOR_DEPENDENCY", "A task that it waits for has not succeeded yet (depends_on), or not ended (same_robot_as).";
     WaitingForTime = "WAITING_FOR_TIME", "Its not_before lies ahead.";
     WaitingForHold = "WAITING_FOR_HOLD", "A hold token stands on the task. Resume it.";
     WaitingInQueue = "WAITING_IN_QUEUE", "Tasks of higher priority or age go first.";
@@ -224,7 +224,7 @@ codes! {
     WaitingForStop = "WAITING_FOR_STOP", "The robot was told to end it and has not confirmed that yet.";
     WorksOnStep = "WORKS_ON_STEP", "The robot works on a step of it.";
     WaitingForRetry = "WAITING_FOR_RETRY", "It failed and waits out its back-off.";
-    DependencyFailed = "DEPENDENCY_FAILED", "A task it depends on ended without success.";
+    DependencyFailed = "DEPENDENCY_FAILED", "A task it depends on ended without success, or the one of same_robot_as without having had a robot.";
     NoRobotAccepts = "NO_ROBOT_ACCEPTS", "It was offered five times in a row and refused each time.";
     NoRobotCan = "NO_ROBOT_CAN", "Every candidate refused it for its content; it cannot be done as asked.";
     AttemptsSpent = "ATTEMPTS_SPENT", "Every allowed attempt failed.";
@@ -245,6 +245,7 @@ codes! {
         => "If a place stays closed, `midshift incident ls` names it: look there, then `midshift zone clear PLACE --reason TEXT --if-match ETAG`.";
     Forced = "FORCED", "A person ended it by force; robot and places stay kept until the robot reports.";
     CanceledByPerson = "CANCELED_BY_PERSON", "A person or program canceled it.";
+    Coalesced = "COALESCED", "A newer task with the same coalesce_key came before a robot had it, and is done in its place.";
     ResolvedByPerson = "RESOLVED_BY_PERSON", "A person resolved it.";
     DrainSuspend = "DRAIN_SUSPEND", "The robot is taken out of work; the task goes on with another.";
     SkippedBusy = "SKIPPED_BUSY", "The robot could not be had in time: a step that may not be interrupted, a load, or a task that may not wait. It works on.";

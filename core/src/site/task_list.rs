@@ -11,7 +11,8 @@ use serde_json::{Map, Value};
 const VIOLATIONS_MAX: usize = 100;
 
 /// Columns that hold text.
-const TEXT_COLUMNS: [&str; 5] = ["task_type", "from_waypoint", "to_waypoint", "item_sku", "robot_id"];
+const TEXT_COLUMNS: [&str; 7] =
+    ["task_type", "from_waypoint", "to_waypoint", "item_sku", "robot_id", "same_robot_as", "coalesce_key"];
 /// Columns that hold whole numbers.
 const NUMBER_COLUMNS: [&str; 5] =
     ["priority", "timeout_seconds", "max_retry_times", "retry_interval_seconds", "schedule_to_start_seconds"];

@@ -26,6 +26,10 @@ pub struct Transport {
     pub retry_interval_ms: Option<i64>,
     /// How long it may be ready before a robot starts. Absent: no limit.
     pub schedule_to_start_ms: Option<i64>,
+    /// Only the robot that had this task. Empty: any.
+    pub same_robot_as: String,
+    /// Of the tasks with one key only the newest stays. Empty: it stands for itself.
+    pub coalesce_key: String,
 }
 
 impl Transport {
@@ -58,6 +62,8 @@ impl Transport {
             timeout_ms: self.timeout_ms,
             schedule_to_start_ms: self.schedule_to_start_ms,
             retry,
+            same_robot_as: self.same_robot_as,
+            coalesce_key: self.coalesce_key,
             ..RawTask::default()
         }
     }

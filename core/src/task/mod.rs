@@ -6,6 +6,7 @@
 
 pub mod bugs;
 pub mod edit;
+pub mod figures;
 pub mod forms;
 pub mod machine;
 pub mod raw;

@@ -46,7 +46,9 @@ pub struct RawTask {
     pub preemptible: bool,
     /// Task ids.
     pub depends_on: Vec<String>,
-    /// Reserved; refused.
+    /// Id of a task; empty: any robot.
+    pub same_robot_as: String,
+    /// Empty: it stands for itself.
     pub coalesce_key: String,
     /// Absent: the area's.
     pub speed_limit_mm_s: Option<u32>,
@@ -142,14 +144,13 @@ impl RawTask {
         let steps = check_steps(&self.steps, field, knows, &mut bad);
         let retry = check_retry(self.retry.as_ref(), field, &mut bad);
         let depends_on = self.check_depends(field, &mut bad);
+        let same_robot_as = self.check_same_robot(field, &mut bad);
         check_labels(&self.labels, &format!("{field}.labels"), &mut bad);
-        if !self.coalesce_key.is_empty() {
-            bad.add(format!("{field}.coalesce_key"), "NOT_SUPPORTED_YET: leave it out");
-        }
         if self.speed_limit_mm_s.is_some_and(|v| !(50..=5_000).contains(&v)) {
             bad.add(format!("{field}.speed_limit_mm_s"), "must be 50..5000 mm/s");
         }
         for (name, text) in [
+            ("coalesce_key", &self.coalesce_key),
             ("requester", &self.requester),
             ("external_ref", &self.external_ref),
             ("trace_context", &self.trace_context),
@@ -173,6 +174,8 @@ impl RawTask {
             retry,
             preemptible: self.preemptible,
             depends_on,
+            same_robot_as,
+            coalesce_key: self.coalesce_key,
             speed_limit_mm_s: self.speed_limit_mm_s,
             labels: self.labels,
             requester: self.requester,
@@ -238,6 +241,17 @@ impl RawTask {
             }
         }
         ids
+    }
+
+    fn check_same_robot(&self, field: &str, bad: &mut Violations) -> Option<TaskId> {
+        if self.same_robot_as.is_empty() {
+            return None;
+        }
+        let at = format!("{field}.same_robot_as");
+        if !self.robot_id.is_empty() {
+            bad.add(&at, "must not be with robot_id: name the robot, or the task whose robot it is");
+        }
+        bad.accept(&at, TaskId::parse(&self.same_robot_as))
     }
 }
 
@@ -378,15 +392,11 @@ mod tests {
     fn transport() -> RawTask {
         super::super::forms::Transport {
             kind: "transport".into(),
-            priority: None,
-            robot_id: String::new(),
             from_waypoint: "A01".into(),
             to_waypoint: "B03".into(),
             item_sku: "SKU-1".into(),
             timeout_ms: Some(300_000),
-            max_retry_times: None,
-            retry_interval_ms: None,
-            schedule_to_start_ms: None,
+            ..super::super::forms::Transport::default()
         }
         .into_raw()
     }
@@ -405,7 +415,9 @@ mod tests {
             kind: "Bad Kind".into(),
             priority: Some(10),
             timeout_ms: None,
-            coalesce_key: "k".into(),
+            coalesce_key: "k".repeat(129),
+            robot_id: "r1".into(),
+            same_robot_as: "no id".into(),
             steps: vec![
                 RawStep::default(),
                 RawStep { kind: Some(RawStepKind::Goto("nowhere".into())), effect: Some(None), ..RawStep::default() },
@@ -426,6 +438,8 @@ mod tests {
                 "spec.steps[1].goto.waypoint",
                 "spec.retry.max_retry_times",
                 "spec.retry.jitter",
+                "spec.same_robot_as",
+                "spec.same_robot_as",
                 "spec.coalesce_key"
             ]
         );

@@ -41,6 +41,12 @@ pub struct TaskSpec {
     pub preemptible: bool,
     /// Tasks that must have SUCCEEDED first.
     pub depends_on: Vec<TaskId>,
+    /// Only the robot that has this task when it ends, which is waited for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub same_robot_as: Option<TaskId>,
+    /// Of the tasks with one key that no robot has the newest alone stays. Empty: it stands for itself.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub coalesce_key: String,
     /// Millimetres per second for this task.
     pub speed_limit_mm_s: Option<u32>,
     /// Free labels.
@@ -141,6 +147,12 @@ impl Class {
 }
 
 impl TaskSpec {
+    /// Tasks whose end is waited for, each once.
+    pub fn waits_for(&self) -> impl Iterator<Item = &TaskId> {
+        let same_robot_as = self.same_robot_as.iter().filter(|id| !self.depends_on.contains(id));
+        self.depends_on.iter().chain(same_robot_as)
+    }
+
     /// Names of all actions, each once.
     pub fn actions(&self) -> std::collections::BTreeSet<&str> {
         self.steps

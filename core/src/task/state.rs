@@ -131,6 +131,12 @@ pub struct TaskState {
     /// Answers to the newest requests to edit, hold or release it, oldest first, at most [`limits::ANSWERS_OF_TASK`].
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub answers: Vec<RequestAnswer>,
+    /// The robot that had the task of `same_robot_as` when it ended. None: not known yet, or not asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub same_robot: Option<RobotId>,
+    /// UTC, since when the first of the tasks was ready that this one stands for by its coalesce key. None: it stands for itself.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub asked_since: Option<Utc>,
 }
 
 impl TaskState {
@@ -154,7 +160,7 @@ impl TaskState {
             semantic_refusers: BTreeSet::new(),
             refusers: BTreeSet::new(),
             queued_since: begins,
-            ready_since: intake.spec.depends_on.is_empty().then_some(begins),
+            ready_since: intake.spec.waits_for().next().is_none().then_some(begins),
             retry_at: None,
             cancel_requested: None,
             started: None,
@@ -165,6 +171,8 @@ impl TaskState {
             priority_since: None,
             operator_hold: None,
             answers: Vec::new(),
+            same_robot: None,
+            asked_since: None,
         }
     }
     /// 0 most urgent ..= 9, as it is now.
@@ -181,7 +189,10 @@ impl TaskState {
     }
     /// The only robot that may do it, as it is now. None: any that is able.
     pub fn pinned_robot<'a>(&'a self, intake: &'a TaskIntake) -> Option<&'a RobotId> {
-        self.edit.robot_id.as_ref().unwrap_or(&intake.spec.robot_id).as_ref()
+        match &self.edit.robot_id {
+            Some(edited) => edited.as_ref(),
+            None => intake.spec.robot_id.as_ref().or(self.same_robot.as_ref()),
+        }
     }
     /// What is wanted now: what was asked for, with what people changed of it.
     pub fn spec(&self, intake: &TaskIntake) -> TaskSpec {

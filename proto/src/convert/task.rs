@@ -147,6 +147,7 @@ fn raw_task(spec: v1::TaskSpec, at: At<'_>, bad: &mut Violations) -> RawTask {
         preemptible: spec.preemptible,
         depends_on: spec.depends_on,
         coalesce_key: spec.coalesce_key,
+        same_robot_as: spec.same_robot_as,
         speed_limit_mm_s: spec.speed_limit_mm_s,
         labels: spec.labels,
         requester: spec.requester,
@@ -218,6 +219,8 @@ fn raw_flat(flat: v1::FlatTask) -> RawTask {
         max_retry_times: flat.max_retry_times.map(i64::from),
         retry_interval_ms: seconds(flat.retry_interval_seconds),
         schedule_to_start_ms: seconds(flat.schedule_to_start_seconds),
+        same_robot_as: flat.same_robot_as,
+        coalesce_key: flat.coalesce_key,
     };
     with_created_at(transport.into_raw(), flat.created_at)
 }
@@ -237,6 +240,8 @@ fn raw_nested(nested: v1::NestedTask) -> RawTask {
         max_retry_times: retry.max_retry_times.map(i64::from),
         retry_interval_ms: seconds(retry.retry_interval_seconds),
         schedule_to_start_ms: seconds(nested.schedule_to_start_seconds),
+        same_robot_as: nested.same_robot_as,
+        coalesce_key: nested.coalesce_key,
     };
     with_created_at(transport.into_raw(), nested.created_at)
 }
@@ -304,7 +309,8 @@ impl From<&TaskSpec> for v1::TaskSpec {
             retry: Some((&spec.retry).into()),
             preemptible: spec.preemptible,
             depends_on: spec.depends_on.iter().map(ToString::to_string).collect(),
-            coalesce_key: String::new(),
+            coalesce_key: spec.coalesce_key.clone(),
+            same_robot_as: spec.same_robot_as.as_ref().map(ToString::to_string).unwrap_or_default(),
             speed_limit_mm_s: spec.speed_limit_mm_s,
             labels: spec.labels.clone(),
             requester: spec.requester.clone(),

@@ -112,7 +112,8 @@ fn broken() -> RawTask {
             ..RawRetry::default()
         }),
         depends_on: vec!["TASK-1".into(); 33],
-        coalesce_key: "k".into(),
+        same_robot_as: "TASK-1".into(),
+        coalesce_key: long.clone(),
         speed_limit_mm_s: Some(1),
         labels: bad_labels,
         requester: long.clone(),

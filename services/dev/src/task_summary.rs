@@ -6,6 +6,7 @@
 
 use midshift_core::ids::TaskId;
 use midshift_core::rows::{BadRow, Key, Log, Row, RowSelection, Seq, Table};
+use midshift_core::task::figures::completion_ms;
 use midshift_core::task::{Phase, TaskIntake, TaskState};
 use midshift_core::time::Utc;
 use midshift_store::{Cursor, Error, FEED_PAGE_MAX, Query, Store};
@@ -71,8 +72,8 @@ impl Tasks {
     /// Seconds of site time from admission to success of the run's tasks, rising.
     pub fn completions_s(&self) -> Vec<f64> {
         let took = |id: &TaskId| {
-            let ended = self.states.get(id).filter(|(phase, _)| *phase == Phase::Succeeded)?.1?;
-            Some(ended.ms_since(self.admitted.get(id)?.created) as f64 / 1000.0)
+            let (phase, ended) = *self.states.get(id)?;
+            Some(completion_ms(phase, self.admitted.get(id)?.created, ended)? as f64 / 1000.0)
         };
         let mut took: Vec<f64> = self.own.iter().filter_map(took).collect();
         took.sort_by(f64::total_cmp);

@@ -2,6 +2,7 @@
 
 use midshift_core::fleet::explain::{RobotExplanation, TaskExplanation};
 use midshift_core::fleet::projection::FleetProjection;
+use midshift_core::fleet::projection::chosen::{PairCost, PlanChoice};
 use midshift_core::fleet::rows::{
     Cordon, HoldToken, HolderState, Incident, Place, RobotControl, RobotCounter, RobotHolder,
 };
@@ -172,6 +173,36 @@ pub fn task_explanation(task_id: &TaskId, e: &TaskExplanation, now: Utc) -> v1::
             .collect(),
         expected_start_time: e.expected.map(timestamp),
         explain_time: Some(timestamp(now)),
+        choice: e.choice.as_ref().map(plan_choice),
+    }
+}
+
+fn plan_choice(choice: &PlanChoice) -> v1::PlanChoice {
+    let next = choice.next.iter().map(|next| v1::NextRobot {
+        robot_id: next.robot_id.to_string(),
+        cost: Some(pair_cost(&next.cost)),
+        task_id: next.took.as_ref().map(ToString::to_string).unwrap_or_default(),
+    });
+    v1::PlanChoice {
+        plan_time: Some(timestamp(choice.at)),
+        robot_id: choice.robot_id.to_string(),
+        given: choice.is_given,
+        cost: Some(pair_cost(&choice.cost)),
+        next: next.collect(),
+        weighed: choice.weighed as u32,
+    }
+}
+
+fn pair_cost(cost: &PairCost) -> v1::PairCost {
+    v1::PairCost {
+        total_ms: cost.sum() / PairCost::UNITS_PER_MS,
+        ready_ms: cost.ready / PairCost::UNITS_PER_MS,
+        way_ms: cost.way / PairCost::UNITS_PER_MS,
+        failed_ms: cost.failed / PairCost::UNITS_PER_MS,
+        charge_ms: cost.charge / PairCost::UNITS_PER_MS,
+        lateness_ms: cost.lateness / PairCost::UNITS_PER_MS,
+        age_ms: cost.age / PairCost::UNITS_PER_MS,
+        kept_ms: cost.kept / PairCost::UNITS_PER_MS,
     }
 }
 

@@ -5,6 +5,7 @@
 
 mod commit;
 mod encode;
+mod figures;
 mod grpc;
 mod reconcile;
 mod requests;

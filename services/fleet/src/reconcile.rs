@@ -6,6 +6,7 @@
 //! Invariant: the view has absorbed the feed up to a head of it before anything is planned on it, never a part of a commit; only a process that leads plans, and one that could not
 //! say so for a while reads the rows again before it does.
 
+use crate::figures::Figures;
 use crate::requests::{Look, MapOutdated, Parts, PendingCommand, Request};
 use midshift_core::fleet::projection::{self, FleetProjection};
 use midshift_core::fleet::{
@@ -66,6 +67,8 @@ pub(crate) struct Loop {
     pub(crate) again: Vec<Request>,
     /// Text of the map that was stored when this process began.
     at_start: OnceLock<Option<String>>,
+    /// What is published of the shift.
+    figures: Figures,
     /// Why this process must not plan on its map; then it ends.
     outdated: Option<MapOutdated>,
 }
@@ -109,6 +112,7 @@ pub async fn run(
         share: limits::DECISIONS_PER_STAGE,
         again: Vec::new(),
         at_start: OnceLock::new(),
+        figures: Figures::default(),
         outdated: None,
     };
     this.rebuild_until_read(&shutdown).await;
@@ -334,7 +338,11 @@ impl Loop {
         let took = begun.elapsed();
         self.rest_after(took);
         metrics::histogram!("midshift_fleet_cycle_seconds").record(took.as_secs_f64());
-        publish(&plan, &self.view, pace);
+        publish(&plan, pace);
+        if pace == Pace::Sweep {
+            self.figures.publish(&self.view, &self.board);
+        }
+        let ended = std::mem::take(&mut plan.report.ended);
         if let Some(generation) = self.view.behind.take() {
             // Restored from a copy: its numbers go on above everything a robot may have seen of it.
             match self.parts.store.raise_head(Seq(generation)).await {
@@ -352,6 +360,7 @@ impl Loop {
         let is_cut = self.more;
         let is_doubted = self.parts.bugs.fenced_reports_rebuild() && plan.report.tally.fenced > 0;
         self.renew_and_commit(renewal, now, plan, replies).await?;
+        self.figures.count(&ended);
         if is_doubted {
             return Err(());
         }
@@ -482,8 +491,8 @@ fn used_ids(requests: &[Request]) -> Vec<Key> {
     ids.map(|id| Key::new(Table::CommandKey, id)).collect()
 }
 
-/// Counts and waiting reasons as metrics; nothing of it goes through the store.
-fn publish(plan: &Plan, view: &FleetProjection, pace: Pace) {
+/// Counts of a turn as metrics; nothing of it goes through the store.
+fn publish(plan: &Plan, pace: Pace) {
     let report = &plan.report;
     metrics::counter!("midshift_fleet_offers_total").increment(report.offers);
     metrics::counter!("midshift_fleet_errands_total").increment(report.errands);
@@ -499,9 +508,5 @@ fn publish(plan: &Plan, view: &FleetProjection, pace: Pace) {
     }
     if pace == Pace::Sweep {
         metrics::gauge!("midshift_fleet_robots_waiting_for_place").set(report.tally.waiting_for_place as f64);
-        metrics::gauge!("midshift_fleet_tasks_open").set(view.tasks.len() as f64);
-        for (code, tasks) in &report.waiting {
-            metrics::gauge!("midshift_fleet_tasks_waiting", "reason" => code.as_str()).set(*tasks as f64);
-        }
     }
 }

@@ -6,4 +6,5 @@
 pub mod clock;
 pub mod door;
 pub mod logs;
+pub mod metrics_catalog;
 pub mod recorder;

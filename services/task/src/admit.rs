@@ -106,14 +106,15 @@ impl TaskService {
         let site = &self.inner.parts.site;
         let spec = submission.check(&|waypoint| site.find(waypoint).is_some())?;
         self.dispatches(&spec, by)?;
-        if !spec.depends_on.is_empty() {
-            let found = are_seen(self.store(), site, by, &spec.depends_on).await?;
-            let unknown = spec.depends_on.iter().zip(found).enumerate().filter(|(_, (_, found))| !found);
+        let depends_on =
+            spec.depends_on.iter().enumerate().map(|(i, id)| (format!("spec.depends_on[{i}]"), id.clone()));
+        let same_robot_as = spec.same_robot_as.iter().map(|id| ("spec.same_robot_as".to_owned(), id.clone()));
+        let (fields, named): (Vec<String>, Vec<TaskId>) = depends_on.chain(same_robot_as).unzip();
+        if !named.is_empty() {
+            let found = are_seen(self.store(), site, by, &named).await?;
+            let unknown = fields.into_iter().zip(&named).zip(found).filter(|(_, found)| !found);
             let violations: Vec<Violation> = unknown
-                .map(|(i, (id, _))| Violation {
-                    field: format!("spec.depends_on[{i}]"),
-                    description: format!("there is no task {id}"),
-                })
+                .map(|((field, id), _)| Violation { field, description: format!("there is no task {id}") })
                 .collect();
             if !violations.is_empty() {
                 return Err(Refusal::invalid(violations));

@@ -75,13 +75,13 @@ impl<'a> Batch<'a> {
         Ok(())
     }
 
-    /// Takes the next item; what came before is committed first if the slice is full or the item depends on it.
+    /// Takes the next item; what came before is committed first if the slice is full or the item names it.
     async fn take_item(&mut self, request: v1::SubmitTaskRequest) -> Result<(), Refusal> {
         if self.results.len() + self.slice.len() >= limits::SUBMIT_ITEMS_MAX {
             return Err(Refusal::field("item", "at most 10000 a call; what came before was admitted"));
         }
-        let depends =
-            matches!(&request.body, Some(Body::Spec(s)) if s.depends_on.iter().any(|id| self.chosen.contains(id)));
+        let depends = matches!(&request.body, Some(Body::Spec(spec))
+            if spec.depends_on.iter().chain([&spec.same_robot_as]).any(|id| !id.is_empty() && self.chosen.contains(id)));
         if depends || self.slice.len() == limits::SUBMIT_SLICE {
             self.flush().await;
         }

@@ -364,11 +364,13 @@ impl Arena {
             self.check("nobody's work is given twice", *times <= 1, found);
         }
         let asked = self.asked.load(Relaxed);
+        let mut succeeded = 0;
         for nth in 0..asked {
             let name = task_name(nth);
             let asked = GetTaskRequest { task_id: name.clone() };
             let got = self.server.tasks()?.get_task(asked).await?.into_inner();
             let (task, attempts) = (got.task.context("an answer without a task")?, got.attempts);
+            succeeded += u64::from(task.state() == TaskState::Succeeded);
             if attempts.iter().any(|attempt| players.contains(&attempt.robot_id)) {
                 continue;
             }
@@ -378,6 +380,8 @@ impl Arena {
         }
         let metrics = Metrics(page(self.server.address, "/metrics").await.context("the server has no metrics")?);
         ensure!(metrics.sum("midshift_telemetry_heartbeats_total", "") > 0, "the metrics count nothing");
+        let counted = metrics.sum("midshift_fleet_tasks_ended_total", "state=\"SUCCEEDED\"");
+        self.check("what is done is counted once", counted == succeeded, || format!("{counted} of {succeeded}"));
         let unexplained = metrics.sum("midshift_fleet_unexplained_total", "");
         self.check("nothing stands unexplained", unexplained == 0, || format!("{unexplained} robots and tasks"));
         let lost = metrics.sum("midshift_fleet_items_lost_total", "conflict=\"false\"");

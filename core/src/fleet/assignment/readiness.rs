@@ -12,12 +12,13 @@ use crate::fleet::tasks::{eligibility, timers};
 use crate::ids::TaskId;
 use crate::limits;
 use crate::reason::{Code, Reason};
-use crate::task::Event;
+use crate::task::{Event, TaskIntake};
 use crate::time::{Now, Utc};
 
 /// Brings the queue up to now: notes since when a task is ready, arms what counts from then, and gives to a person what can never be ready.
 pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     advance(view, now.utc);
+    coalesce(view, now, plan);
     for task_id in view.queue.failed.iter().take(TASKS_PER_TURN).cloned().collect::<Vec<_>>() {
         let why = view.queue.waiting.get(&task_id).and_then(|w| w.wait.reason());
         if plan.is_cut() {
@@ -34,6 +35,7 @@ pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut 
         plan.decide(view, now, "fleet", |tx| {
             if is_unmarked && let Some(mut task) = tx.view.task(&task_id).cloned() {
                 task.ready_since = Some(now.utc);
+                task.same_robot = tx.view.robot_asked_for(&task_id).cloned();
                 tx.put_row(task, "task.ready");
             }
             timers::count_readiness(tx, &task_id);
@@ -41,6 +43,32 @@ pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut 
         view.queue.moved.remove(&task_id);
     }
     check_robots(view, now, plan);
+}
+
+/// Ends tasks that a newer one with the same key replaces. What they had waited for already counts for the newer one.
+fn coalesce(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
+    let replaced = view.same_key.replaced().take(TASKS_PER_TURN);
+    let replaced: Vec<_> = replaced.map(|(older, newest)| (older.clone(), newest.clone())).collect();
+    for (older, newest) in replaced {
+        if plan.is_cut() {
+            return;
+        }
+        let is_wanted_first = |by: &TaskIntake| by.spec.waits_for().any(|id| *id == older);
+        let Some((was, mut stays)) = view.task(&older).zip(view.task(&newest).cloned()) else { continue };
+        if view.intake(&newest).is_none_or(is_wanted_first) {
+            continue;
+        }
+        let asked = [was.asked_since, was.ready_since, stays.asked_since].into_iter().flatten().min();
+        stays.asked_since = asked.filter(|asked| *asked <= now.utc);
+        let told = format!("The newer task {newest} with the same coalesce_key replaces it.");
+        let why = Reason::new(Code::Coalesced, told).with("task_id", &newest);
+        plan.decide(view, now, "fleet", |tx| {
+            apply_event(tx, &older, News::from_event(Event::Cancel, Some(&why)));
+            if tx.view.task(&newest) != Some(&stays) {
+                tx.put_row(stays.clone(), "task.replaces");
+            }
+        });
+    }
 }
 
 /// Gives a waiting task to a person.

@@ -1,7 +1,6 @@
 //! The report of a cycle: what was done, what was counted, and why the rest was not done.
 
-use crate::reason::Code;
-use std::collections::BTreeMap;
+use crate::task::figures::TaskFigures;
 
 /// The fact of a reason that names what is waited for.
 pub const WAITS_FOR: &str = "waits_for";
@@ -32,8 +31,8 @@ pub struct Report {
     pub looked: u64,
     /// Something was left for the next turn.
     pub more: bool,
-    /// Waiting tasks by reason.
-    pub waiting: BTreeMap<Code, u64>,
+    /// Tasks that have ended.
+    pub ended: Vec<TaskFigures>,
     /// What was counted on the way.
     pub tally: Tally,
     /// Robots and tasks that stand for long without a reason, once each; logged.

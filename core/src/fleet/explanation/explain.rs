@@ -5,6 +5,7 @@ use crate::fleet::assignment::demand::Demand;
 use crate::fleet::assignment::filters;
 use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::facts::misreads;
+use crate::fleet::projection::chosen::PlanChoice;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::load;
@@ -43,6 +44,8 @@ pub struct TaskExplanation {
     pub filtered: BTreeMap<Code, u64>,
     /// UTC, when its robot will be free; now, if as many are eligible as tasks go before it. None: nobody can tell.
     pub expected: Option<Utc>,
+    /// Why the newest plan that gave it to a robot, or meant it for one, chose that robot. None: none did, or that is forgotten.
+    pub choice: Option<PlanChoice>,
 }
 
 /// Explains one task; none if it is not known or has ended.
@@ -102,7 +105,8 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
     let verdict = wait_reasons::of_task(view, board, now, task, intake).or_else(|| waits.then(turn));
     let verdict = verdict.or_else(|| task.reason.clone());
     let expected = expected.filter(|_| position.is_some());
-    Some(TaskExplanation { position, verdict, candidates, filtered, expected })
+    let choice = view.chosen.get(task_id).cloned();
+    Some(TaskExplanation { position, verdict, candidates, filtered, expected, choice })
 }
 
 /// Why each robot with a session gets no work, looked at once for all explanations of a turn.
@@ -121,13 +125,18 @@ pub fn per_turn(robots: usize) -> usize {
 pub fn stored(task: &TaskState) -> TaskExplanation {
     let unread = || Reason::from(Code::WaitingInQueue).with(WAITS_FOR, "the planner: it has not read the task yet");
     let verdict = Some(if task.phase.is_terminal() { wait_reasons::ended(task) } else { unread() });
-    TaskExplanation { position: None, verdict, candidates: Vec::new(), filtered: BTreeMap::new(), expected: None }
+    only(verdict)
 }
 
 /// A task one of whose rows holds a value of a newer version.
 pub fn unknown(reason: Reason) -> TaskExplanation {
     let verdict = Some(reason.with(WAITS_FOR, "the newer version of the server"));
-    TaskExplanation { position: None, verdict, candidates: Vec::new(), filtered: BTreeMap::new(), expected: None }
+    only(verdict)
+}
+
+fn only(verdict: Option<Reason>) -> TaskExplanation {
+    let (candidates, filtered) = (Vec::new(), BTreeMap::new());
+    TaskExplanation { position: None, verdict, candidates, filtered, expected: None, choice: None }
 }
 
 /// The robot that a task waits for, and what keeps that one.

@@ -3,7 +3,7 @@
 //!
 //! Invariant: what is derived depends on the rows alone, never on the order in which they came.
 
-use super::queue::{TASKS_PER_TURN, Wait};
+use super::queue::{Ended, TASKS_PER_TURN, Wait};
 use super::rows::{Drain, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotHolder};
 use super::state::FleetProjection;
 use crate::ids::{RobotId, TaskId};
@@ -23,11 +23,11 @@ impl Indexed<TaskState> for FleetProjection {
         if let Some(task) = view.tasks.get(id).map(|t| &t.row) {
             view.dirty.extend(task.robot_id.clone());
             view.unasked.remove(&task_id);
-            let phase = task.phase;
-            if !phase.is_terminal() {
-                note_open(view, &task_id);
+            if task.phase.is_terminal() {
+                let end = Ended::from(task);
+                note_end(view, &task_id, end);
             } else {
-                note_end(view, &task_id, phase);
+                note_open(view, &task_id);
             }
         }
         put_in_queue(view, &task_id);
@@ -36,11 +36,12 @@ impl Indexed<TaskState> for FleetProjection {
 
 impl Indexed<TaskIntake> for FleetProjection {
     fn changed(view: &mut Self, id: &str, old: Option<&TaskIntake>) {
-        let waits_for = view.intakes.get(id).map(|i| i.row.spec.depends_on.clone()).unwrap_or_default();
+        let spec = view.intakes.get(id).map(|i| &i.row.spec);
+        let waits_for: Vec<TaskId> = spec.into_iter().flat_map(|spec| spec.waits_for()).cloned().collect();
         for task_id in waits_for {
-            let known = view.tasks.get(task_id.as_str()).map(|t| t.row.phase);
-            if let Some(phase) = known.filter(|phase| phase.is_terminal()) {
-                view.ended.insert(task_id.clone(), phase);
+            let known = view.tasks.get(task_id.as_str()).map(|t| &t.row);
+            if let Some(task) = known.filter(|task| task.phase.is_terminal()) {
+                view.ended.insert(task_id.clone(), task.into());
             } else if known.is_none() && !view.ended.contains_key(&task_id) {
                 view.unasked.insert(task_id.clone());
             }
@@ -196,17 +197,18 @@ pub(in crate::fleet) fn put_in_queue(view: &mut FleetProjection, task_id: &TaskI
     });
     view.queue.set_wait(task_id, wait);
     let rows = view.tasks.get(task_id.as_str()).map(|t| &t.row).zip(view.intakes.get(task_id.as_str()).map(|i| &i.row));
+    view.same_key.put_task(task_id, rows);
     if view.ready.put_task(task_id, view.queue.rank(task_id), rows, |goal| view.site.find(goal)) {
         view.queue.show_again(task_id);
     }
 }
 
 /// A task has ended: those that depend on it, if there are any, wait for the next thing, or for nothing more.
-pub(in crate::fleet) fn note_end(view: &mut FleetProjection, task_id: &TaskId, phase: Phase) {
+pub(in crate::fleet) fn note_end(view: &mut FleetProjection, task_id: &TaskId, end: Ended) {
     if !view.dependants.contains_key(task_id) {
         return;
     }
-    view.ended.insert(task_id.clone(), phase);
+    view.ended.insert(task_id.clone(), end);
     for dependent in view.queue.dependents.get(task_id).cloned().unwrap_or_default() {
         put_in_queue(view, &dependent);
     }
@@ -219,7 +221,7 @@ pub(in crate::fleet) fn note_open(view: &mut FleetProjection, task_id: &TaskId) 
     }
     let intakes = view.intakes.values().map(|intake| &intake.row);
     let dependents: Vec<TaskId> =
-        intakes.filter(|intake| intake.spec.depends_on.contains(task_id)).map(|i| i.task_id.clone()).collect();
+        intakes.filter(|intake| intake.spec.waits_for().any(|id| id == task_id)).map(|i| i.task_id.clone()).collect();
     for dependent in dependents {
         put_in_queue(view, &dependent);
     }
@@ -239,7 +241,7 @@ pub(in crate::fleet) fn advance(view: &mut FleetProjection, now: Utc) {
 impl FleetProjection {
     /// A task is over, or gone: nothing is asked any more of those that it waited for alone.
     pub(super) fn waits_no_more(&mut self, intake: &TaskIntake) {
-        for task_id in &intake.spec.depends_on {
+        for task_id in intake.spec.waits_for() {
             let Some(left) = self.dependants.get_mut(task_id) else { continue };
             *left -= 1;
             if *left == 0 {

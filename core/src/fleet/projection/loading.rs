@@ -10,6 +10,7 @@ use super::state::FleetProjection;
 use crate::ids::TaskId;
 use crate::limits;
 use crate::rows::{BadRow, Key, Revision, Row, RowSelection, Seq, Table};
+use crate::task::figures::TaskFigures;
 use crate::task::{AttemptPhase, Phase, TaskIntake, TaskState};
 
 /// What the projection begins with: all that is alive. [`named`] says what is read with it.
@@ -38,7 +39,7 @@ pub fn named(rows: &[Row]) -> Vec<Key> {
             }
             Table::TaskIntake => {
                 let Ok(intake) = row.decode::<TaskIntake>() else { continue };
-                keys.extend(intake.spec.depends_on.iter().map(|id| Key::new(Table::TaskState, id.as_str())));
+                keys.extend(intake.spec.waits_for().map(|id| Key::new(Table::TaskState, id.as_str())));
             }
             Table::RobotAuthority => {
                 let holder = row.decode::<RobotAuthority>().map(|a| a.holder);
@@ -95,7 +96,7 @@ impl FleetProjection {
                 }
                 Table::TaskState => {
                     match row.decode::<TaskState>() {
-                        Ok(task) if task.phase.is_terminal() => index::note_end(self, &task.task_id, task.phase),
+                        Ok(task) if task.phase.is_terminal() => index::note_end(self, &task.task_id, (&task).into()),
                         Err(error) if !error.is_unknown() => return Err(error),
                         // It has not ended, as far as anybody here knows.
                         _ => {}
@@ -146,16 +147,19 @@ impl FleetProjection {
         }
     }
 
-    /// Lets go of tasks that have ended and of attempts that neither hold a robot nor are the newest of a live task.
-    pub fn forget_ended(&mut self) {
+    /// Lets go of tasks that have ended and of attempts that neither hold a robot nor are the newest of a live task. Gives back what the tasks
+    /// came to.
+    pub fn forget_ended(&mut self) -> Vec<TaskFigures> {
         // What is let go is committed after this, and comes by the feed before the feed is taken further than that.
         let absorbed = self.absorbed;
         self.let_go.retain(|_, at| *at >= absorbed);
         let ended: Vec<TaskId> =
             self.tasks.values().filter(|t| t.row.phase.is_terminal()).map(|t| t.row.task_id.clone()).collect();
+        let mut figures = Vec::with_capacity(ended.len());
         for id in ended {
-            self.tasks.remove(id.as_str());
+            let task = self.tasks.remove(id.as_str());
             if let Some(intake) = self.intakes.remove(id.as_str()) {
+                figures.extend(task.map(|task| TaskFigures::of_rows(&task.row, &intake.row)));
                 self.waits_no_more(&intake.row);
             }
             self.let_go.insert(id, absorbed);
@@ -175,6 +179,7 @@ impl FleetProjection {
                 .is_some_and(|t| tasks.get(t.as_str()).is_some_and(|t| t.row.epoch == a.attempt.epoch));
             holds || newest || !a.phase.is_terminal()
         });
+        figures
     }
 
     /// Forgets what a planner would have to look at: whoever plans next begins with a projection of its own.

@@ -28,7 +28,7 @@ pub struct Rank {
     pub promoted: bool,
     /// Of equal class the smaller goes first; 0 once promoted, where only age counts.
     priority: u8,
-    /// UTC, site clock, since when it is ready.
+    /// UTC, site clock, since when it is ready, or the first that it stands for by its key.
     pub since: Utc,
     /// Admission number. Several processes may give the same one.
     number: u64,
@@ -40,6 +40,7 @@ pub struct Rank {
 
 impl Rank {
     fn of_task(task: &TaskState, intake: &TaskIntake, since: Utc, now: Utc) -> Self {
+        let since = task.asked_since.map_or(since, |asked| asked.min(since));
         let priority = task.priority(intake);
         let promoted_from = task.priority_since.map_or(since, |changed| changed.max(since));
         let class = Class::from_priority(priority, promotions(promoted_from, now));
@@ -61,6 +62,21 @@ fn promotions(since: Utc, now: Utc) -> u64 {
     now.ms_since(since) / limits::MAX_WAIT.as_ms()
 }
 
+/// How a task ended that others wait for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Ended {
+    /// Terminal.
+    pub phase: Phase,
+    /// The robot that had it last. None: none had it.
+    pub robot_id: Option<RobotId>,
+}
+
+impl From<&TaskState> for Ended {
+    fn from(task: &TaskState) -> Self {
+        Self { phase: task.phase, robot_id: task.robot_id.clone() }
+    }
+}
+
 /// What a task that wants a robot waits for first.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Wait {
@@ -72,29 +88,32 @@ pub enum Wait {
     Time(Utc),
     /// The last of the tokens that hold it.
     Hold(String),
-    /// The end of another task.
+    /// The end of another task: its success, or which robot had it.
     Dependency(TaskId),
-    /// The success of another task, which ended otherwise.
+    /// The success of another task, which ended otherwise, or its robot, which it never had.
     Failed(TaskId),
 }
 
 impl Wait {
     /// What a task waits for, whatever its phase.
-    pub fn of_task(task: &TaskState, intake: &TaskIntake, ended: &BTreeMap<TaskId, Phase>, now: Utc) -> Self {
+    pub fn of_task(task: &TaskState, intake: &TaskIntake, ended: &BTreeMap<TaskId, Ended>, now: Utc) -> Self {
         if let Some(at) = task.not_before(intake).filter(|at| *at > now) {
             return Self::Time(at);
         }
         if let Some(token) = task.holds.first() {
             return Self::Hold(token.clone());
         }
-        for id in &intake.spec.depends_on {
-            match ended.get(id) {
-                Some(Phase::Succeeded) => {}
-                Some(_) => return Self::Failed(id.clone()),
-                None => return Self::Dependency(id.clone()),
+        let (depends_on, same_robot_as) = (&intake.spec.depends_on, &intake.spec.same_robot_as);
+        for id in intake.spec.waits_for() {
+            let Some(end) = ended.get(id) else { return Self::Dependency(id.clone()) };
+            let lacks_robot = same_robot_as.as_ref() == Some(id) && end.robot_id.is_none();
+            if lacks_robot || (end.phase != Phase::Succeeded && depends_on.contains(id)) {
+                return Self::Failed(id.clone());
             }
         }
-        task.ready_since.map_or(Self::Mark, |since| Self::Turn(Rank::of_task(task, intake, since, now)))
+        let is_marked = same_robot_as.is_none() || task.same_robot.is_some();
+        let since = task.ready_since.filter(|_| is_marked);
+        since.map_or(Self::Mark, |since| Self::Turn(Rank::of_task(task, intake, since, now)))
     }
     /// What it waits for, in one word.
     fn code(&self) -> Code {

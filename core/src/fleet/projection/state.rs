@@ -2,14 +2,16 @@
 //!
 //! Every room of `fleet` reads it. Rows come in by `loading`; `index` keeps what is derived.
 
+use super::chosen::Chosen;
 use super::memory::{Agenda, AttachedTime, Lasting, Meant, UnansweredOffers, Unexplained, Waiting};
-use super::queue::Queue;
+use super::queue::{Ended, Queue};
 use super::ready::ReadyTasks;
 use super::refused::Refused;
 use super::rows::{
     AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, PlaceHolder, RobotAuthority, RobotControl,
     RobotCounter, RobotHolder, ServiceClock, SiteRow, Timer,
 };
+use super::same_key::SameKey;
 use crate::desired_state::{DesiredPolicy, DesiredWork};
 use crate::drain_request::{DrainRelease, DrainRequest};
 use crate::fleet::bugs::Bugs;
@@ -24,7 +26,7 @@ use crate::session::{LaneMark, Session};
 use crate::site::Site;
 use crate::site::route::{Blocked, Router};
 use crate::stop::record::StopRecord;
-use crate::task::{Attempt, Phase, TaskIntake, TaskState};
+use crate::task::{Attempt, TaskIntake, TaskState};
 use crate::time::{Now, Utc};
 use crate::unknown_rows::UnknownRows;
 use smol_str::format_smolstr;
@@ -107,6 +109,8 @@ projection! {
         lasting: Lasting = Lasting::new();
         /// Robots that ready tasks are meant for once those are free.
         meant: Meant = Meant::default();
+        /// Why tasks went to the robots that they went to.
+        chosen: Chosen = Chosen::default();
         /// Tasks that gave way to an urgent one, and when, site clock.
         gave_way: BTreeMap<TaskId, crate::time::SiteTime> = BTreeMap::new();
         /// What stands without a reason.
@@ -134,7 +138,9 @@ projection! {
         /// What is due by time and not done yet. Volatile.
         agenda: Agenda = Agenda::default();
         /// How tasks ended that a task waits for which has not.
-        ended: BTreeMap<TaskId, Phase> = BTreeMap::new();
+        ended: BTreeMap<TaskId, Ended> = BTreeMap::new();
+        /// Tasks with a coalesce key that no robot has.
+        same_key: SameKey = SameKey::default();
         /// How many tasks that have not ended wait for a task.
         dependants: BTreeMap<TaskId, u32> = BTreeMap::new();
         /// Tasks that another one waits for, and that this projection knows nothing of: whoever keeps it asks the store.
@@ -203,6 +209,12 @@ impl FleetProjection {
     /// What was asked for.
     pub fn intake(&self, id: &TaskId) -> Option<&TaskIntake> {
         self.intakes.get(id.as_str()).map(|t| &t.row)
+    }
+
+    /// The robot that had the task which this one names in `same_robot_as`. None: it names none, or that has not ended.
+    pub fn robot_asked_for(&self, id: &TaskId) -> Option<&RobotId> {
+        let named = self.intake(id)?.spec.same_robot_as.as_ref()?;
+        self.ended.get(named)?.robot_id.as_ref()
     }
 
     /// The attempt's row.

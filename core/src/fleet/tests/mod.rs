@@ -6,6 +6,7 @@ mod changes;
 mod closed_places;
 mod drains;
 mod energy;
+mod figures;
 mod incidents;
 mod labels;
 mod lasting;
@@ -16,6 +17,8 @@ mod order;
 mod planner;
 mod preemption;
 mod rolling;
+mod same_key;
+mod same_robot;
 mod unexplained;
 
 use super::projection::{FleetProjection, RevisedRow};

@@ -53,6 +53,25 @@ fn all_ways_together_are_the_shortest_not_that_of_the_first_task() {
 }
 
 #[test]
+fn a_choice_is_told_from_the_costs_that_decided_with_what_the_next_robot_took() {
+    let mut rig = line();
+    rig.robot("left", "c0");
+    rig.robot("right", "c60");
+    rig.submit("first", visits(&[40]));
+    rig.submit("second", visits(&[100]));
+    rig.cycle(Pace::Wake);
+    let first = TaskId::parse("first").expect("an id");
+    let told = explain::task(&rig.view, &rig.board, &rig.now, &first).expect("a task");
+    let choice = told.choice.expect("a plan gave it");
+    assert_eq!((choice.robot_id.as_str(), choice.is_given, choice.weighed), ("left", true, 2));
+    // Each metre is a second and weighs twice.
+    assert_eq!((choice.cost.way, choice.cost.sum()), (80_000_000, 80_000_000));
+    let next: Vec<_> =
+        choice.next.iter().map(|n| (n.robot_id.as_str(), n.cost.sum(), n.took.as_ref().map(TaskId::as_str))).collect();
+    assert_eq!(next, [("right", 40_000_000, Some("second"))], "nearer, and worth more elsewhere");
+}
+
+#[test]
 fn a_robot_takes_the_task_that_is_near_to_it_unless_another_has_waited_ten_times_as_long_as_the_way() {
     let mut rig = line();
     rig.submit("old", visits(&[100]));

@@ -3,6 +3,7 @@
 use crate::harness::{Shaky, World};
 use crate::old_site::OldSite;
 use midshift_core::fleet::bugs::Bugs;
+use midshift_core::fleet::projection::FleetProjection;
 use midshift_core::ids::TaskId;
 use midshift_core::leadership::FleetLeader;
 use midshift_core::reason::Code;
@@ -11,6 +12,7 @@ use midshift_core::task::Phase;
 use midshift_core::time::Clock;
 use midshift_fleet::FleetService;
 use midshift_store::{MemoryStore, Store, StoreId};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -66,7 +68,11 @@ async fn only_those_ended_tasks_are_known_that_a_task_waits_for() {
     w.until_phase("T1", Phase::Running).await;
     let known = |of: &FleetService| {
         let of = of.clone();
-        async move { of.query_projection(|view, _, _| view.ended.clone()).await.expect("the reconciler runs") }
+        async move {
+            let phases = |view: &FleetProjection| view.ended.iter().map(|(id, end)| (id.clone(), end.phase)).collect();
+            let known = of.query_projection(move |view, _, _| -> BTreeMap<TaskId, Phase> { phases(view) });
+            known.await.expect("the reconciler runs")
+        }
     };
     let id = |id: &str| TaskId::parse(id).expect("an id");
     let both = [(id("old-1"), Phase::Succeeded), (id("old-3"), Phase::Failed)];

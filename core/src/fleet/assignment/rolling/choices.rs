@@ -38,6 +38,8 @@ pub struct Choice {
     pub robot: usize,
     /// Index of the task.
     pub task: usize,
+    /// What it is about.
+    pub pair: cost::Pair,
     /// What it costs, before the worth of its class.
     pub cost: i64,
 }
@@ -263,8 +265,8 @@ impl<'a> Finder<'a> {
             has_failed: task.failed_robots.contains(robot_id),
             is_meant: looked.meant_for == Some(robot_id),
         };
-        let cost = cost::of_pair(policy, &now, &robots[robot], &self.found.urgencies[nth], &pair);
-        self.found.pairs.push(Choice { robot, task: nth, cost });
+        let cost = cost::of_pair(policy, &now, &robots[robot], &self.found.urgencies[nth], &pair).sum();
+        self.found.pairs.push(Choice { robot, task: nth, pair, cost });
         true
     }
 

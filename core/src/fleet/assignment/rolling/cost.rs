@@ -5,12 +5,12 @@
 
 use super::robots::Robot;
 use crate::fleet::assignment::estimate::USUAL_MM_S;
+use crate::fleet::projection::chosen::PairCost;
 use crate::planner_policy::PlannerPolicy;
 use crate::task::spec::Class;
 use crate::time::{Now, Utc};
 
-/// Units of a millisecond. What is below only breaks ties.
-const UNITS_PER_MS: i64 = 1_000;
+const UNITS_PER_MS: i64 = PairCost::UNITS_PER_MS;
 /// No term counts more than so many milliseconds: 18 hours.
 const TERM_MS_MAX: u64 = 1 << 26;
 /// A robot that failed the task stands behind one that is so much farther away, milliseconds.
@@ -38,19 +38,25 @@ pub struct Pair {
     pub is_meant: bool,
 }
 
-/// What a pair costs before the worth of its class.
-pub fn of_pair(policy: &PlannerPolicy, now: &Now, robot: &Robot, urgency: &Urgency, pair: &Pair) -> i64 {
+/// What a pair costs before the worth of its class, term by term.
+pub fn of_pair(policy: &PlannerPolicy, now: &Now, robot: &Robot, urgency: &Urgency, pair: &Pair) -> PairCost {
     let weight = i64::from(policy.travel_weight(urgency.class));
-    let eta_ms = robot.ready_ms.saturating_add(pair.way_mm * 1_000 / USUAL_MM_S);
+    let way_ms = pair.way_mm * 1_000 / USUAL_MM_S;
     let failed_ms = if pair.has_failed { FAILED_MS } else { 0 };
     let age_ms = now.ms_since(urgency.since);
+    let eta_ms = robot.ready_ms.saturating_add(way_ms);
     let late_ms = urgency.deadline.map_or(0, |at| now.utc.plus_ms(eta_ms).ms_since(at));
     let meant_ms = if pair.is_meant { policy.hysteresis_ms } else { 0 };
-    weight * units(eta_ms.saturating_add(failed_ms).saturating_add(robot.loss_ms))
-        - units(age_ms) * i64::from(policy.ageing_permille) / 1_000
-        - units(late_ms) * i64::from(policy.lateness_permille) / 1_000
-        - weight * units(meant_ms)
-        + robot.tasks.min(UNITS_PER_MS as u64 - 1) as i64
+    PairCost {
+        ready: weight * units(robot.ready_ms),
+        way: weight * units(way_ms),
+        failed: weight * units(failed_ms),
+        charge: weight * units(robot.loss_ms),
+        lateness: -units(late_ms) * i64::from(policy.lateness_permille) / 1_000,
+        age: -units(age_ms) * i64::from(policy.ageing_permille) / 1_000,
+        kept: -weight * units(meant_ms),
+        tie: robot.tasks.min(UNITS_PER_MS as u64 - 1) as i64,
+    }
 }
 
 fn units(ms: u64) -> i64 {

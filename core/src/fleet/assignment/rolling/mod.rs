@@ -4,7 +4,7 @@
 //! meant for them is memory of this process, no row and no promise.
 //!
 //! In reading order: `robots` that may take something; what a pair costs (`cost`); which pairs are weighed (`choices`); the
-//! pairs of least cost (`least_cost`); what gives way to urgent tasks (`preemption`). Called by `assign`. Invariants:
+//! pairs of least cost (`least_cost`); why these (`reasons`); what gives way to urgent tasks (`preemption`). Called by `assign`. Invariants:
 //! 1. A task of a higher class goes first, and as many tasks are given as can be.
 //! 2. The same rows, heartbeats and memory give the same pairs, in whatever order they came.
 
@@ -12,19 +12,22 @@ mod choices;
 mod cost;
 mod least_cost;
 pub mod preemption;
+mod reasons;
 mod robots;
 
 use super::candidates::Candidate;
 use super::{filters, offers};
 use crate::fleet::decision::plan::Plan;
+use crate::fleet::projection::chosen::PlanChoice;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::queue::Walk;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::errand_reports;
-use crate::ids::{RobotId, TaskId};
+use crate::ids::RobotId;
 use crate::planner_policy::PlannerPolicy;
 use crate::time::Now;
 use choices::{Choices, Finder, Scene};
+use reasons::Reasons;
 use robots::{Free, ROBOTS_MAX, Robot};
 use std::collections::BTreeSet;
 
@@ -64,11 +67,12 @@ pub fn plan(
         (find_by_robot(view, scene, heard, &present, plan), None)
     };
     let mut pairs = pair_up(robots.len(), &choices);
-    pairs.sort_by(|(_, a), (_, b)| view.queue.rank(a).cmp(&view.queue.rank(b)));
+    pairs.sort_by(|(_, a), (_, b)| view.queue.rank(&choices.tasks[*a]).cmp(&view.queue.rank(&choices.tasks[*b])));
+    let mut reasons = Reasons::new(&choices, &pairs);
     plan.slice.renew();
     let (mut given, mut recalled, mut meant) = (BTreeSet::new(), false, Vec::new());
-    for (robot, task_id) in pairs {
-        let Robot { robot_id, free, ready_ms, .. } = &robots[robot];
+    for (robot, nth) in pairs {
+        let (Robot { robot_id, free, ready_ms, .. }, task_id) = (&robots[robot], choices.tasks[nth].clone());
         // The first is decided in any case: else a turn might do nothing, and the next one the same.
         if *free != Free::Soon && (recalled || !given.is_empty()) && plan.is_cut() {
             continue;
@@ -81,6 +85,8 @@ pub fn plan(
             if view.held_by(robot_id).is_some() {
                 plan.report.offers += 1;
                 given.insert(robot_id.clone());
+                let why = reasons.of_task(nth, robot, &scene);
+                view.chosen.note_choice(task_id, PlanChoice { is_given: true, ..why });
             }
             continue;
         }
@@ -88,6 +94,8 @@ pub fn plan(
             plan.decide(view, now, "fleet", |tx| errand_reports::stop_errand(tx, robot_id));
             recalled |= !filters::recallable(view, board, robot_id);
         }
+        let why = reasons.of_task(nth, robot, &scene);
+        view.chosen.note_choice(task_id.clone(), why);
         meant.push((task_id, robot_id.clone(), now.utc.plus_ms(*ready_ms)));
     }
     view.meant.put_plan(meant, now.site);
@@ -179,8 +187,8 @@ fn find_by_task(
     (finder.into_choices(), Some(walk))
 }
 
-/// The pairs of least cost, as indices of robots with ids of tasks.
-fn pair_up(robots: usize, choices: &Choices) -> Vec<(usize, TaskId)> {
+/// The pairs of least cost, as indices of robots and tasks.
+fn pair_up(robots: usize, choices: &Choices) -> Vec<(usize, usize)> {
     let tasks = choices.tasks.len();
     let largest = choices.pairs.iter().map(|choice| choice.cost.abs()).max().unwrap_or(0);
     let are_robots_rows = robots <= tasks;
@@ -192,6 +200,5 @@ fn pair_up(robots: usize, choices: &Choices) -> Vec<(usize, TaskId)> {
     }
     let pairs = least_cost::pair_up(&rows, robots.max(tasks)).into_iter().enumerate();
     let pairs = pairs.filter_map(|(row, column)| Some((row, column?)));
-    let pairs = pairs.map(|(row, column)| if are_robots_rows { (row, column) } else { (column, row) });
-    pairs.map(|(robot, task)| (robot, choices.tasks[task].clone())).collect()
+    pairs.map(|(row, column)| if are_robots_rows { (row, column) } else { (column, row) }).collect()
 }

@@ -1,0 +1,63 @@
+//! Figures of the shift as it is now: what robots do, and how far they drove. Counted from rows, so a restart changes none of them.
+
+use crate::fleet::projection::liveness::Board;
+use crate::fleet::projection::rows::RobotHolder;
+use crate::fleet::projection::state::FleetProjection;
+use crate::fleet::traffic::routing;
+use crate::ids::{AttemptId, RobotId};
+use crate::task::state::Errand;
+use std::collections::BTreeMap;
+
+/// Figures of the shift at one moment.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct FleetFigures {
+    /// Robots by what has them: `task`, `charge`, `park`, `update` (a drain), or `nothing`.
+    pub robots: BTreeMap<&'static str, u64>,
+    /// Robots with too little charge for work that nothing has: no charger is free, or they are out of work.
+    pub waits_for_charger: u64,
+    /// Millimetres driven, by work (`task`, `errand`) and load (`yes`, `no`).
+    pub driven_mm: [(&'static str, &'static str, u64); 3],
+}
+
+impl FleetFigures {
+    /// As the rows and the newest heartbeats say.
+    pub fn new(view: &FleetProjection, board: &Board) -> Self {
+        let mut robots = BTreeMap::from(["task", "charge", "park", "update", "nothing"].map(|does| (does, 0)));
+        let mut waits_for_charger = 0;
+        let authorities = view.authority.values().map(|authority| &authority.row);
+        for authority in authorities.filter(|a| view.sessions.contains_key(a.robot_id.as_str())) {
+            let does = match &authority.holder {
+                RobotHolder::None => "nothing",
+                RobotHolder::Maintenance(_) => "update",
+                RobotHolder::Attempt(id) => work(view, id),
+            };
+            *robots.entry(does).or_default() += 1;
+            waits_for_charger += u64::from(does == "nothing" && must_charge(view, board, &authority.robot_id));
+        }
+        let (mut empty, mut loaded, mut errands) = (0_u64, 0_u64, 0_u64);
+        for counter in view.counters.values().map(|counter| &counter.row) {
+            let on_errands = counter.errands.path_mm;
+            let on_tasks = counter.stats.path_mm.saturating_sub(on_errands);
+            loaded = loaded.saturating_add(counter.stats.loaded_path_mm);
+            empty = empty.saturating_add(on_tasks.saturating_sub(counter.stats.loaded_path_mm));
+            errands = errands.saturating_add(on_errands);
+        }
+        let driven_mm = [("task", "yes", loaded), ("task", "no", empty), ("errand", "no", errands)];
+        Self { robots, waits_for_charger, driven_mm }
+    }
+}
+
+fn work(view: &FleetProjection, attempt: &AttemptId) -> &'static str {
+    match view.attempt(attempt).and_then(|attempt| attempt.errand) {
+        None => "task",
+        Some(Errand::Charge) => "charge",
+        Some(Errand::Park) => "park",
+    }
+}
+
+fn must_charge(view: &FleetProjection, board: &Board, robot_id: &RobotId) -> bool {
+    let Some(vitals) = board.get(robot_id).map(|live| &live.report.vitals) else { return false };
+    let Some(at) = routing::find(view, vitals.waypoint.as_ref()) else { return false };
+    let least = view.policy(&view.site.area_of(at).area_id).charge_mandatory_permille;
+    vitals.battery_permille < least && view.site.chargers().next().is_some()
+}
