@@ -5,6 +5,7 @@ use super::out::{Format, Out, plain};
 use midshift_core::fleet::WAITS_FOR;
 use midshift_core::reason::Code;
 use midshift_proto::common::v1::Reason;
+use midshift_proto::convert::time_of;
 use midshift_proto::fleet::v1::{PairCost, PlanChoice};
 
 /// The lines of an explanation that say what is done or waited for; `nothing`: in case there is no reason.
@@ -20,7 +21,8 @@ pub fn verdict(reason: Option<&Reason>, nothing: &str) -> String {
 /// Why a plan chose a robot for a task, and what the next ones would have cost.
 pub fn choice(choice: &PlanChoice) -> String {
     let robot = plain(&choice.robot_id);
-    let chosen = if choice.given { format!("given to {robot}") } else { format!("meant for {robot}") };
+    let at = choice.plan_time.as_ref().map_or_else(String::new, |at| format!(" at {}", time_of(at).rfc3339()));
+    let chosen = format!("{} {robot}{at}", if choice.given { "given to" } else { "meant for" });
     let mut text = format!("  {chosen}: {}\n", choice.cost.as_ref().map_or_else(String::new, cost));
     for next in &choice.next {
         let took = match next.task_id.as_str() {

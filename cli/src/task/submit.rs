@@ -38,7 +38,7 @@ pub struct Submit {
     /// Only the robot that had this task, once that has ended.
     #[arg(long, default_value = "", conflicts_with = "robot")]
     same_robot_as: String,
-    /// Of the tasks with one key that no robot has, only the newest stays.
+    /// Of the ready tasks with one key and the same areas only the newest stays.
     #[arg(long, default_value = "")]
     coalesce_key: String,
     /// Also if nobody knows a robot that a task names: it waits until that robot comes.

@@ -2,11 +2,14 @@
 
 use super::spec::Class;
 use super::{Phase, TaskIntake, TaskState};
+use crate::ids::TaskId;
 use crate::time::Utc;
 
 /// What a task came to that has ended.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TaskFigures {
+    /// Which task.
+    pub task_id: TaskId,
     /// How it ended.
     pub phase: Phase,
     /// By its priority, without what waiting brought it.
@@ -25,6 +28,7 @@ impl TaskFigures {
     /// By its rows.
     pub fn of_rows(task: &TaskState, intake: &TaskIntake) -> Self {
         Self {
+            task_id: task.task_id.clone(),
             phase: task.phase,
             class: Class::from_priority(task.priority(intake), 0),
             kind: intake.spec.kind.clone(),

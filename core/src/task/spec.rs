@@ -44,7 +44,7 @@ pub struct TaskSpec {
     /// Only the robot that has this task when it ends, which is waited for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub same_robot_as: Option<TaskId>,
-    /// Of the tasks with one key that no robot has the newest alone stays. Empty: it stands for itself.
+    /// Of the ready tasks with one key and the same areas the newest alone stays. Empty: it stands for itself.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub coalesce_key: String,
     /// Millimetres per second for this task.

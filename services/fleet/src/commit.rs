@@ -14,10 +14,11 @@ use midshift_core::limits;
 use midshift_core::projection::{self, DecisionKey};
 use midshift_core::reason::{Code, Kind, Refusal};
 use midshift_core::rows::{Key, Row, Seq, Table};
+use midshift_core::task::figures::TaskFigures;
 use midshift_core::time::Now;
 use midshift_store::leadership::{self, GroupOutcome};
 use midshift_store::{Applied, CommitError, Error, GET_KEYS_MAX, Store};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// What is known of an item once it is with the store.
 struct Sent {
@@ -37,6 +38,19 @@ impl Sent {
     }
 }
 
+/// Of tasks that have ended those whose end is in the store: what the last item that touches one says, or what others wrote.
+fn committed(ended: Vec<TaskFigures>, results: &[Result<Applied, CommitError>], sent: &[Sent]) -> Vec<TaskFigures> {
+    if ended.is_empty() {
+        return ended;
+    }
+    let is_applied = sent.iter().zip(results).flat_map(|(sent, result)| {
+        let tasks = sent.keys.iter().filter(|key| key.table == Table::TaskState);
+        tasks.map(|key| (&*key.id, result.is_ok()))
+    });
+    let is_applied: BTreeMap<&str, bool> = is_applied.collect();
+    ended.into_iter().filter(|task| is_applied.get(task.task_id.as_str()) != Some(&false)).collect()
+}
+
 impl Loop {
     /// Commits the plan, and before it that this process still leads, if it is time to say so. An error: the projection can no longer be trusted.
     pub(crate) async fn renew_and_commit(
@@ -46,6 +60,7 @@ impl Loop {
         plan: Plan,
         replies: Replies,
     ) -> Result<(), ()> {
+        let ended = std::mem::take(&mut self.figures.ended);
         let renews = renewal.is_some();
         let items: Vec<Item> = renewal.into_iter().chain(plan.items).collect();
         let sent: Vec<Sent> = items.iter().map(Sent::from_item).collect();
@@ -54,6 +69,7 @@ impl Loop {
             self.lease.claimed(now.link);
         }
         let lost = self.count(&results, &sent, renews);
+        self.figures.count(&committed(ended, &results, &sent));
         let results = results.split_off(usize::from(renews));
         for (asked, items) in replies {
             self.settle(asked, results.get(items));

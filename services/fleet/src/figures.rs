@@ -6,40 +6,67 @@ use midshift_core::fleet::projection::FleetProjection;
 use midshift_core::fleet::{Board, FleetFigures};
 use midshift_core::reason::Code;
 use midshift_core::task::figures::TaskFigures;
+use midshift_core::time::{LinkDuration, LinkTime, Now};
 use std::collections::BTreeSet;
 
 /// Types of tasks that are told apart; others are `other`.
 const TYPES_MAX: usize = 32;
 
-/// What labels were used so far.
+/// How often what stands now is published.
+const EVERY: LinkDuration = LinkDuration::from_secs(1);
+
+/// What was published so far.
 #[derive(Debug, Default)]
 pub(crate) struct Figures {
     types: BTreeSet<String>,
     reasons: BTreeSet<Code>,
+    place_waits: u64,
+    published: Option<LinkTime>,
+    /// Tasks that have ended, until it is known whether that is committed.
+    pub(crate) ended: Vec<TaskFigures>,
 }
 
 impl Figures {
     /// Publishes what stands now.
-    pub(crate) fn publish(&mut self, view: &FleetProjection, board: &Board) {
-        let now = FleetFigures::new(view, board);
-        for (does, robots) in now.robots {
+    pub(crate) fn publish(&mut self, view: &FleetProjection, board: &Board, now: &Now) {
+        if self.published.is_some_and(|at| now.link.since(at) < EVERY) {
+            return;
+        }
+        self.published = Some(now.link);
+        self.set(&FleetFigures::new(view, board, now), view.tasks.len());
+        let waits = view.place_waits.saturating_sub(self.place_waits);
+        metrics::counter!("midshift_fleet_place_waits_total").increment(waits);
+        self.place_waits = view.place_waits;
+        self.set_waiting(view.queue.counts());
+    }
+
+    /// Another process leads, and says what stands.
+    pub(crate) fn leave(&mut self) {
+        self.set(&FleetFigures::default(), 0);
+        self.set_waiting(std::iter::empty());
+        (self.place_waits, self.published) = (0, None);
+    }
+
+    fn set(&self, now: &FleetFigures, tasks_open: usize) {
+        for does in FleetFigures::DOES {
+            let robots = now.robots.get(does).copied().unwrap_or_default();
             metrics::gauge!("midshift_fleet_robots", "does" => does).set(robots as f64);
         }
         metrics::gauge!("midshift_fleet_robots_waiting_for_charger").set(now.waits_for_charger as f64);
+        metrics::gauge!("midshift_fleet_tasks_open").set(tasks_open as f64);
         for (work, load, mm) in now.driven_mm {
             metrics::counter!("midshift_fleet_driven_metres_total", "work" => work, "load" => load)
                 .absolute(mm / 1_000);
         }
-        metrics::counter!("midshift_fleet_place_waits_total").absolute(view.place_waits);
-        metrics::gauge!("midshift_fleet_tasks_open").set(view.tasks.len() as f64);
-        let mut gone = std::mem::take(&mut self.reasons);
-        for (code, tasks) in view.queue.counts() {
+    }
+
+    fn set_waiting(&mut self, counts: impl Iterator<Item = (Code, u64)>) {
+        let before = std::mem::take(&mut self.reasons);
+        for (code, tasks) in before.into_iter().map(|code| (code, 0)).chain(counts) {
             metrics::gauge!("midshift_fleet_tasks_waiting", "reason" => code.as_str()).set(tasks as f64);
-            gone.remove(&code);
-            self.reasons.insert(code);
-        }
-        for code in gone {
-            metrics::gauge!("midshift_fleet_tasks_waiting", "reason" => code.as_str()).set(0.0);
+            if tasks > 0 {
+                self.reasons.insert(code);
+            }
         }
     }
 
@@ -69,13 +96,29 @@ impl Figures {
 mod tests {
     use super::*;
     use metrics_exporter_prometheus::PrometheusBuilder;
+    use midshift_core::ids::TaskId;
     use midshift_core::task::Phase;
     use midshift_core::task::spec::Class;
+
+    #[test]
+    fn a_reason_that_nobody_waits_for_any_more_goes_to_zero() {
+        let recorder = PrometheusBuilder::new().build_recorder();
+        let page = metrics::with_local_recorder(&recorder, || {
+            let mut figures = Figures::default();
+            figures.set_waiting([(Code::WaitingForRobot, 3), (Code::WaitingForTime, 1)].into_iter());
+            figures.set_waiting([(Code::WaitingForRobot, 2)].into_iter());
+            recorder.handle().render()
+        });
+        let has = |line: &str| assert!(page.lines().any(|found| found == line), "{line}: {page}");
+        has("midshift_fleet_tasks_waiting{reason=\"WAITING_FOR_ROBOT\"} 2");
+        has("midshift_fleet_tasks_waiting{reason=\"WAITING_FOR_TIME\"} 0");
+    }
 
     #[test]
     fn types_beyond_the_first_are_counted_as_others() {
         let recorder = PrometheusBuilder::new().build_recorder();
         let task = |nth: usize| TaskFigures {
+            task_id: TaskId::parse(&format!("T{nth}")).expect("an id"),
             phase: Phase::Succeeded,
             class: Class::Normal,
             kind: format!("type-{nth}"),

@@ -295,7 +295,15 @@ impl FleetService {
             .query_projection(move |view, board, now| {
                 let found = explain::task(view, board, now, &asked).filter(|_| sees_task(view, &reader, &asked));
                 let found = found.map(|mut found| {
-                    found.candidates.retain(|c| sees_robot(view, board, &reader, &c.robot_id));
+                    let sees = |robot_id: &RobotId| sees_robot(view, board, &reader, robot_id);
+                    found.candidates.retain(|c| sees(&c.robot_id));
+                    found.choice = found.choice.filter(|choice| choice.is_given || sees(&choice.robot_id));
+                    if let Some(choice) = &mut found.choice {
+                        choice.next.retain(|next| sees(&next.robot_id));
+                        for next in &mut choice.next {
+                            next.took = next.took.take().filter(|task_id| sees_task(view, &reader, task_id));
+                        }
+                    }
                     encode::task_explanation(&asked, &found, now.utc)
                 });
                 (found, now.utc)

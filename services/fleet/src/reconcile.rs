@@ -68,7 +68,7 @@ pub(crate) struct Loop {
     /// Text of the map that was stored when this process began.
     at_start: OnceLock<Option<String>>,
     /// What is published of the shift.
-    figures: Figures,
+    pub(crate) figures: Figures,
     /// Why this process must not plan on its map; then it ends.
     outdated: Option<MapOutdated>,
 }
@@ -162,8 +162,9 @@ async fn page_after(store: &dyn Store, cursor: &mut Seq) -> Result<FeedPage, Err
     }
 }
 
-fn leads_no_more() {
+fn leads_no_more(figures: &mut Figures) {
     metrics::gauge!("midshift_fleet_leads").set(0);
+    figures.leave();
     tracing::info!("this process does not lead fleet any more");
 }
 
@@ -189,7 +190,7 @@ impl Loop {
         let began =
             leadership::claim_if_free(&mut self.lease, self.parts.store.as_ref(), self.parts.clock.as_ref()).await;
         if led && !self.lease.leads() {
-            leads_no_more();
+            leads_no_more(&mut self.figures);
         }
         if began? {
             self.begin_to_lead();
@@ -214,7 +215,7 @@ impl Loop {
         if !is_said {
             tracing::warn!("another process will lead fleet only after a while: this one could not say that it ends");
         }
-        leads_no_more();
+        leads_no_more(&mut self.figures);
     }
 
     /// Builds the projection from nothing and takes what was not consumed yet. A process that leads makes sure that it may plan on its map.
@@ -340,9 +341,9 @@ impl Loop {
         metrics::histogram!("midshift_fleet_cycle_seconds").record(took.as_secs_f64());
         publish(&plan, pace);
         if pace == Pace::Sweep {
-            self.figures.publish(&self.view, &self.board);
+            self.figures.publish(&self.view, &self.board, &now);
         }
-        let ended = std::mem::take(&mut plan.report.ended);
+        self.figures.ended = std::mem::take(&mut plan.report.ended);
         if let Some(generation) = self.view.behind.take() {
             // Restored from a copy: its numbers go on above everything a robot may have seen of it.
             match self.parts.store.raise_head(Seq(generation)).await {
@@ -360,7 +361,6 @@ impl Loop {
         let is_cut = self.more;
         let is_doubted = self.parts.bugs.fenced_reports_rebuild() && plan.report.tally.fenced > 0;
         self.renew_and_commit(renewal, now, plan, replies).await?;
-        self.figures.count(&ended);
         if is_doubted {
             return Err(());
         }

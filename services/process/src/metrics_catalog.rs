@@ -1,8 +1,6 @@
-//! Every metric that a program of midshift has, with what it says: HELP on the page of metrics, and the table of docs/metrics.md.
+//! Every metric that a program of midshift has, with what it says: HELP of a scrape, and docs/metrics.md.
 //!
 //! Called by `recorder`. Invariant: what a program counts is here, and nothing else (the architecture test).
-
-use std::fmt::Write;
 
 /// How a metric is read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -125,11 +123,11 @@ pub const METRICS: &[Metric] = &[
     ),
     gauge(
         "midshift_fleet_robots",
-        "Robots that have a session, by what has them: `does` task, charge, park, update or nothing. Utilisation is the share of task.",
+        "Robots that are not offline, by what has them: `does` task, charge, park, update or nothing. Utilisation is the share of task.",
     ),
     gauge(
         "midshift_fleet_robots_waiting_for_charger",
-        "Robots with too little charge for work that nothing has: no charger is free for them, or they are out of work.",
+        "Robots with too little charge for work that nothing has: no charger is free for them yet, or they are kept from work.",
     ),
     gauge("midshift_fleet_robots_waiting_for_place", "Robots that wait for a place on their way."),
     counter("midshift_fleet_stale_authority_total", "Messages that robots refused, since their authority had ended."),
@@ -144,7 +142,7 @@ pub const METRICS: &[Metric] = &[
     ),
     shift(
         "midshift_fleet_task_wait_seconds",
-        "Site time from when only a robot was missing until one took the task; `class` and `type`; of tasks that a robot took and that have ended.",
+        "Site time from when first only a robot was missing until one took the task, holds included; `class` and `type`; of tasks that a robot took and that have ended.",
     ),
     counter(
         "midshift_fleet_tasks_ended_total",
@@ -234,37 +232,9 @@ pub const METRICS: &[Metric] = &[
     counter("midshift_telemetry_status_replayed_total", "Samples that came late, from a robot's own memory."),
 ];
 
-/// The page of all metrics.
-pub fn page() -> String {
-    let mut page = String::from(
-        "# Metrics\n\nWhat `/metrics` of a process has, in the text form of Prometheus; made from the program. Counters begin at 0 with the\nprocess, unless they say otherwise. Site time is that of the fleet, which a simulation may speed up.\n\n| name | kind | what it says |\n|---|---|---|\n",
-    );
-    for Metric { name, kind, help } in METRICS {
-        let kind = match kind {
-            Kind::Counter => "counter",
-            Kind::Gauge => "gauge",
-            Kind::Histogram(_) => "histogram",
-        };
-        let _ = writeln!(page, "| `{name}` | {kind} | {help} |");
-    }
-    page
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn golden_page_of_metrics() {
-        let here = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
-        let root = here.ancestors().find(|folder| folder.join("Cargo.lock").is_file()).expect("a workspace");
-        let path = root.join("docs/metrics.md");
-        if std::env::var_os("BLESS").is_some() {
-            std::fs::write(&path, page()).expect("docs/metrics.md");
-        }
-        let stored = std::fs::read_to_string(&path).unwrap_or_default();
-        assert_eq!(stored, page(), "`cargo xtask golden` if the change is meant");
-    }
 
     #[test]
     fn metrics_stand_in_order_and_once() {

@@ -55,7 +55,7 @@ mod tests {
         });
         let page = handle.render();
         let has = |line: &str| assert!(page.contains(line), "{line}: {page}");
-        has("# HELP midshift_fleet_task_wait_seconds Site time from when only a robot was missing");
+        has("# HELP midshift_fleet_task_wait_seconds Site time from when first only a robot was missing");
         has("# TYPE midshift_fleet_task_wait_seconds histogram");
         has("midshift_fleet_task_wait_seconds_bucket{class=\"urgent\",type=\"transport\",le=\"20\"} 0");
         has("midshift_fleet_task_wait_seconds_bucket{class=\"urgent\",type=\"transport\",le=\"30\"} 1");

@@ -80,8 +80,7 @@ impl<'a> Batch<'a> {
         if self.results.len() + self.slice.len() >= limits::SUBMIT_ITEMS_MAX {
             return Err(Refusal::field("item", "at most 10000 a call; what came before was admitted"));
         }
-        let depends = matches!(&request.body, Some(Body::Spec(spec))
-            if spec.depends_on.iter().chain([&spec.same_robot_as]).any(|id| !id.is_empty() && self.chosen.contains(id)));
+        let depends = named_ids(&request).any(|id| !id.is_empty() && self.chosen.contains(id));
         if depends || self.slice.len() == limits::SUBMIT_SLICE {
             self.flush().await;
         }
@@ -164,6 +163,17 @@ async fn read_ahead(
 }
 
 /// The id a request asks for; empty: none.
+/// Ids of tasks that a request names: they are to be there before it.
+fn named_ids(request: &v1::SubmitTaskRequest) -> impl Iterator<Item = &String> {
+    let (depends_on, same_robot_as) = match &request.body {
+        Some(Body::Spec(spec)) => (spec.depends_on.as_slice(), Some(&spec.same_robot_as)),
+        Some(Body::Flat(flat)) => (&[][..], Some(&flat.same_robot_as)),
+        Some(Body::Nested(nested)) => (&[][..], Some(&nested.same_robot_as)),
+        None => (&[][..], None),
+    };
+    depends_on.iter().chain(same_robot_as)
+}
+
 fn chosen_id(request: &v1::SubmitTaskRequest) -> &str {
     match &request.body {
         _ if !request.task_id.is_empty() => &request.task_id,

@@ -247,8 +247,21 @@ impl Serving {
     }
 }
 
-/// What looks at a store without changing it: each call reads about as much as it hands out.
+/// What looks at a store without changing it: each call reads about as much as it hands out. Of three counts the least: what the server
+/// reads beside the calls, when its lease or its housekeeping is due, is counted with them.
 async fn is_looked_up_by_index(serving: &Serving) -> anyhow::Result<()> {
+    let mut read = look_up(serving).await?;
+    for _ in 0..2 {
+        let again = look_up(serving).await?;
+        read.iter_mut().zip(again).for_each(|(read, again)| read.1 = read.1.min(again.1));
+    }
+    say!("rows read: {read:?}");
+    ensure!(read.iter().all(|(_, rows)| *rows <= READ_BY_A_CALL), "rows read: {read:?}");
+    Ok(())
+}
+
+/// Calls and how many rows were read for each.
+async fn look_up(serving: &Serving) -> anyhow::Result<[(&'static str, usize); 6]> {
     let ended = ended()?;
     let newest: Vec<String> = (0..10).map(|back| task_id(ended - back).to_string()).collect();
     let by_robot = TaskFilter { robot_ids: vec!["old-r1".to_owned()], ..TaskFilter::default() };
@@ -279,17 +292,14 @@ async fn is_looked_up_by_index(serving: &Serving) -> anyhow::Result<()> {
     let of_others = task_summary::read_once(serving.counted.clone(), "dev-", before).await?.of_others();
     ensure!(of_others == 1, "a run's client knows of what is alive, not of {of_others}");
     let tallied = serving.counted.take_count();
-    let read = [
+    Ok([
         ("all", all.1),
         ("a robot's", of_robot.1),
         ("a prefix", prefixed.1),
         ("one", one.1),
         ("watch", watched),
         ("tally", tallied),
-    ];
-    say!("rows read: {read:?}");
-    ensure!(read.iter().all(|(_, rows)| *rows <= READ_BY_A_CALL), "rows read: {read:?}");
-    Ok(())
+    ])
 }
 
 async fn starts_and_answers(engine: Engine) -> anyhow::Result<()> {

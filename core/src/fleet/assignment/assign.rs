@@ -5,6 +5,7 @@
 use super::candidates::Candidate;
 use super::{nearest, rolling};
 use crate::fleet::decision::plan::Plan;
+use crate::fleet::projection::chosen::Chosen;
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::RobotId;
@@ -30,6 +31,9 @@ pub fn plan(
         }
         AssignmentPolicy::Rolling | AssignmentPolicy::FifoNearest => {
             view.meant.put_plan(Vec::new(), now.site);
+            if policy.policy == AssignmentPolicy::FifoNearest {
+                view.chosen = Chosen::default();
+            }
             nearest::plan(view, board, now, heard, plan)
         }
     }

@@ -12,7 +12,7 @@ use crate::fleet::tasks::{eligibility, timers};
 use crate::ids::TaskId;
 use crate::limits;
 use crate::reason::{Code, Reason};
-use crate::task::{Event, TaskIntake};
+use crate::task::Event;
 use crate::time::{Now, Utc};
 
 /// Brings the queue up to now: notes since when a task is ready, arms what counts from then, and gives to a person what can never be ready.
@@ -45,19 +45,17 @@ pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut 
     check_robots(view, now, plan);
 }
 
-/// Ends tasks that a newer one with the same key replaces. What they had waited for already counts for the newer one.
+/// Ends ready tasks that a newer one with the same key replaces, but those that others wait for. What they had waited for already counts for the
+/// newer one.
 fn coalesce(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
-    let replaced = view.same_key.replaced().take(TASKS_PER_TURN);
-    let replaced: Vec<_> = replaced.map(|(older, newest)| (older.clone(), newest.clone())).collect();
+    let replaced = view.same_key.replaced().filter(|(older, _)| !view.dependants.contains_key(older));
+    let replaced: Vec<_> =
+        replaced.take(TASKS_PER_TURN).map(|(older, newest)| (older.clone(), newest.clone())).collect();
     for (older, newest) in replaced {
         if plan.is_cut() {
-            return;
+            break;
         }
-        let is_wanted_first = |by: &TaskIntake| by.spec.waits_for().any(|id| *id == older);
         let Some((was, mut stays)) = view.task(&older).zip(view.task(&newest).cloned()) else { continue };
-        if view.intake(&newest).is_none_or(is_wanted_first) {
-            continue;
-        }
         let asked = [was.asked_since, was.ready_since, stays.asked_since].into_iter().flatten().min();
         stays.asked_since = asked.filter(|asked| *asked <= now.utc);
         let told = format!("The newer task {newest} with the same coalesce_key replaces it.");
@@ -69,6 +67,7 @@ fn coalesce(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
             }
         });
     }
+    plan.slice.renew();
 }
 
 /// Gives a waiting task to a person.

@@ -1,31 +1,37 @@
 //! Figures of the shift as it is now: what robots do, and how far they drove. Counted from rows, so a restart changes none of them.
 
-use crate::fleet::projection::liveness::Board;
+use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::rows::RobotHolder;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::traffic::routing;
 use crate::ids::{AttemptId, RobotId};
+use crate::presence::Presence;
 use crate::task::state::Errand;
+use crate::time::Now;
 use std::collections::BTreeMap;
 
 /// Figures of the shift at one moment.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct FleetFigures {
-    /// Robots by what has them: `task`, `charge`, `park`, `update` (a drain), or `nothing`.
+    /// Robots that are not offline, by what has them: `task`, `charge`, `park`, `update` (a drain), or `nothing`.
     pub robots: BTreeMap<&'static str, u64>,
-    /// Robots with too little charge for work that nothing has: no charger is free, or they are out of work.
+    /// Of these, such with too little charge for work that nothing has.
     pub waits_for_charger: u64,
     /// Millimetres driven, by work (`task`, `errand`) and load (`yes`, `no`).
     pub driven_mm: [(&'static str, &'static str, u64); 3],
 }
 
 impl FleetFigures {
+    /// What may have a robot, or nothing.
+    pub const DOES: [&'static str; 5] = ["task", "charge", "park", "update", "nothing"];
+
     /// As the rows and the newest heartbeats say.
-    pub fn new(view: &FleetProjection, board: &Board) -> Self {
-        let mut robots = BTreeMap::from(["task", "charge", "park", "update", "nothing"].map(|does| (does, 0)));
+    pub fn new(view: &FleetProjection, board: &Board, now: &Now) -> Self {
+        let mut robots = BTreeMap::from(Self::DOES.map(|does| (does, 0)));
         let mut waits_for_charger = 0;
         let authorities = view.authority.values().map(|authority| &authority.row);
-        for authority in authorities.filter(|a| view.sessions.contains_key(a.robot_id.as_str())) {
+        let is_here = |robot_id: &RobotId| liveness::presence(board, robot_id, now) != Presence::Offline;
+        for authority in authorities.filter(|a| is_here(&a.robot_id)) {
             let does = match &authority.holder {
                 RobotHolder::None => "nothing",
                 RobotHolder::Maintenance(_) => "update",

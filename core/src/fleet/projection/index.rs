@@ -188,16 +188,18 @@ fn move_deadline(view: &mut FleetProjection, task_id: &TaskId, old: Option<Utc>,
 /// Puts a task where its rows say that it stands: out of the queue, if it waits for no robot.
 pub(in crate::fleet) fn put_in_queue(view: &mut FleetProjection, task_id: &TaskId) {
     let rows = view.task(task_id).filter(|task| task.phase == Phase::Queued).zip(view.intake(task_id));
+    let mut is_ready = false;
     let wait = rows.map(|(task, intake)| {
         let wait = match Wait::of_task(task, intake, &view.ended, view.queue.now) {
             Wait::Turn(rank) if view.bugs.nobody_is_promoted() => Wait::Turn(rank.unpromoted(task.priority(intake))),
             wait => wait,
         };
+        is_ready = matches!(wait, Wait::Turn(_) | Wait::Mark);
         (wait, task.queued_since)
     });
     view.queue.set_wait(task_id, wait);
     let rows = view.tasks.get(task_id.as_str()).map(|t| &t.row).zip(view.intakes.get(task_id.as_str()).map(|i| &i.row));
-    view.same_key.put_task(task_id, rows);
+    view.same_key.put_task(task_id, rows.filter(|_| is_ready), &view.site);
     if view.ready.put_task(task_id, view.queue.rank(task_id), rows, |goal| view.site.find(goal)) {
         view.queue.show_again(task_id);
     }

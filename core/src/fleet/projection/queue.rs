@@ -67,13 +67,13 @@ fn promotions(since: Utc, now: Utc) -> u64 {
 pub struct Ended {
     /// Terminal.
     pub phase: Phase,
-    /// The robot that had it last. None: none had it.
+    /// The robot that had it last, if any took it.
     pub robot_id: Option<RobotId>,
 }
 
 impl From<&TaskState> for Ended {
     fn from(task: &TaskState) -> Self {
-        Self { phase: task.phase, robot_id: task.robot_id.clone() }
+        Self { phase: task.phase, robot_id: task.robot_id.clone().filter(|_| task.started.is_some()) }
     }
 }
 
@@ -104,14 +104,20 @@ impl Wait {
             return Self::Hold(token.clone());
         }
         let (depends_on, same_robot_as) = (&intake.spec.depends_on, &intake.spec.same_robot_as);
+        // A person has said which robot.
+        let is_edited = task.edit.robot_id.is_some();
         for id in intake.spec.waits_for() {
+            let (is_for_robot, must_succeed) = (same_robot_as.as_ref() == Some(id), depends_on.contains(id));
+            if task.same_robot.is_some() && !must_succeed {
+                continue;
+            }
             let Some(end) = ended.get(id) else { return Self::Dependency(id.clone()) };
-            let lacks_robot = same_robot_as.as_ref() == Some(id) && end.robot_id.is_none();
-            if lacks_robot || (end.phase != Phase::Succeeded && depends_on.contains(id)) {
+            let lacks_robot = is_for_robot && end.robot_id.is_none() && !is_edited;
+            if lacks_robot || (end.phase != Phase::Succeeded && must_succeed) {
                 return Self::Failed(id.clone());
             }
         }
-        let is_marked = same_robot_as.is_none() || task.same_robot.is_some();
+        let is_marked = same_robot_as.is_none() || task.same_robot.is_some() || is_edited;
         let since = task.ready_since.filter(|_| is_marked);
         since.map_or(Self::Mark, |since| Self::Turn(Rank::of_task(task, intake, since, now)))
     }

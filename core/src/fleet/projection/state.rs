@@ -139,7 +139,7 @@ projection! {
         agenda: Agenda = Agenda::default();
         /// How tasks ended that a task waits for which has not.
         ended: BTreeMap<TaskId, Ended> = BTreeMap::new();
-        /// Tasks with a coalesce key that no robot has.
+        /// Ready tasks with a coalesce key.
         same_key: SameKey = SameKey::default();
         /// How many tasks that have not ended wait for a task.
         dependants: BTreeMap<TaskId, u32> = BTreeMap::new();

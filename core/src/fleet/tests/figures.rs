@@ -57,7 +57,7 @@ fn robots_are_counted_by_what_has_them_and_way_by_work_and_load() {
         attached_ms: 0,
         counted: rig.now.utc,
     });
-    let figures = FleetFigures::new(&rig.view, &rig.board);
+    let figures = FleetFigures::new(&rig.view, &rig.board, &rig.now);
     let robots = |does| figures.robots[does];
     assert_eq!((robots("task"), robots("nothing"), robots("charge")), (1, 2, 0));
     assert_eq!(figures.waits_for_charger, 1);

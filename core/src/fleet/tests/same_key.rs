@@ -1,4 +1,4 @@
-//! Of the tasks with one coalesce key that no robot has, the newest stays.
+//! Of the ready tasks with one coalesce key the newest stays.
 
 use super::*;
 use crate::reason::Code;
@@ -72,13 +72,13 @@ fn a_task_that_a_robot_has_stays_until_it_is_given_back() {
     rig.cycle(Pace::Wake);
     assert_eq!((rig.task("first").phase, rig.order()), (Phase::Assigned, vec!["second".to_owned()]));
     let mut back = rig.task("first").clone();
-    (back.phase, back.retry_at) = (Phase::RetryWait, Some(rig.now.utc.plus_ms(60_000)));
+    back.phase = Phase::Queued;
     rig.change(&back);
     assert_eq!(rig.replace(), [ended("first", "second")]);
 }
 
 #[test]
-fn what_a_person_holds_what_is_opened_and_what_the_newer_one_waits_for_stay() {
+fn what_a_person_holds_and_what_is_opened_stay() {
     let mut rig = Rig::new();
     rig.keyed("held", |_| {});
     let mut held = rig.task("held").clone();
@@ -88,9 +88,46 @@ fn what_a_person_holds_what_is_opened_and_what_the_newer_one_waits_for_stay() {
     let mut opened = rig.task("opened").clone();
     opened.opened_robot_id = RobotId::parse("r1").ok();
     rig.change(&opened);
-    rig.keyed("needed", |_| {});
-    rig.keyed("newest", |raw| raw.depends_on = vec!["needed".into()]);
+    rig.keyed("newest", |_| {});
     assert_eq!(rig.replace(), []);
-    let phases = ["held", "opened", "needed", "newest"].map(|id| rig.task(id).phase);
-    assert_eq!(phases, [Phase::Queued; 4]);
+}
+
+#[test]
+fn what_any_other_task_waits_for_stays() {
+    let mut rig = Rig::new();
+    rig.keyed("needed", |_| {});
+    rig.submit("after", |raw| raw.depends_on = vec!["needed".into()]);
+    rig.keyed("middle", |_| {});
+    rig.keyed("newest", |_| {});
+    assert_eq!(rig.replace(), [ended("middle", "newest")]);
+}
+
+#[test]
+fn a_task_whose_time_has_not_come_replaces_none_and_is_replaced_by_none() {
+    let mut rig = Rig::new();
+    let at = |ms| move |raw: &mut RawTask| raw.not_before = Some(BEGIN.plus_ms(ms));
+    rig.keyed("first", at(60_000));
+    rig.pass(30_000);
+    rig.keyed("second", at(90_000));
+    assert_eq!(rig.replace(), [], "else a request each half minute would never come to its time");
+    rig.pass(30_000);
+    assert_eq!((rig.replace(), rig.order()), (vec![], vec!["first".to_owned()]));
+    rig.pass(30_000);
+    assert_eq!(rig.replace(), [ended("first", "second")]);
+    assert_eq!(rig.order(), ["second"]);
+}
+
+#[test]
+fn a_task_that_goes_to_other_areas_is_another_one() {
+    let mut rig = Rig::on(crate::site::DEMO);
+    let goes = |waypoint: &'static str| {
+        move |raw: &mut RawTask| {
+            let goto = crate::task::raw::RawStepKind::Goto(waypoint.into());
+            raw.steps = vec![crate::task::raw::RawStep { kind: Some(goto), ..Default::default() }];
+        }
+    };
+    for (id, to) in [("hall", "A01"), ("packing", "P01"), ("hall-too", "B03")] {
+        rig.keyed(id, goes(to));
+    }
+    assert_eq!(rig.replace(), [ended("hall", "hall-too")], "whoever sends to one area ends nothing in another");
 }

@@ -23,6 +23,7 @@ impl Rig {
     fn end(&mut self, id: &str, phase: Phase) {
         let mut task = self.task(id).clone();
         task.phase = phase;
+        task.started = task.robot_id.as_ref().map(|_| self.now.utc);
         let robot_id = task.robot_id.clone();
         self.change(&task);
         if let Some(authority) = robot_id.and_then(|id| self.view.authority.get_mut(id.as_str())) {
@@ -56,6 +57,30 @@ fn a_persons_word_of_the_robot_goes_before_it() {
         rig.cycle(Pace::Wake);
         assert_eq!(rig.task("return").robot_id, robot("r1"));
     }
+}
+
+#[test]
+fn a_robot_that_was_offered_that_task_and_did_not_take_it_did_not_have_it() {
+    let mut rig = rig();
+    let mut task = rig.task("bring").clone();
+    task.phase = Phase::Canceled;
+    rig.change(&task);
+    rig.cycle(Pace::Wake);
+    assert_eq!(rig.task("return").phase, Phase::NeedsOperator);
+}
+
+#[test]
+fn where_no_robot_had_that_task_a_persons_word_is_enough() {
+    let mut rig = Rig::new();
+    rig.robot("r1", "A");
+    rig.submit("bring", |raw| raw.not_before = Some(BEGIN.plus_ms(60_000)));
+    rig.submit("return", |raw| raw.same_robot_as = "bring".into());
+    let mut task = rig.task("return").clone();
+    task.edit = TaskEdit { robot_id: Some(robot("r1")), ..TaskEdit::default() };
+    rig.change(&task);
+    rig.end("bring", Phase::Canceled);
+    rig.cycle(Pace::Wake);
+    assert_eq!(rig.task("return").robot_id, robot("r1"));
 }
 
 #[test]

@@ -217,6 +217,8 @@ async fn migrate(data: &std::path::Path, database: &Database, out: &Out) -> Resu
 #[cfg(test)]
 mod deployed;
 #[cfg(test)]
+mod metrics_page;
+#[cfg(test)]
 mod page;
 #[cfg(test)]
 mod tests {

@@ -133,7 +133,7 @@ fn item(command: &Command, arg: &Arg) -> String {
 }
 
 /// Lines of at most [`LINE_MAX`] characters, all but the first behind `indent`; a word that is longer stands alone.
-fn wrapped(text: &str, indent: &str) -> String {
+pub(super) fn wrapped(text: &str, indent: &str) -> String {
     let (mut lines, mut line) = (String::new(), String::new());
     for word in text.split(' ') {
         if !line.trim().is_empty() && line.chars().count() + 1 + word.chars().count() > LINE_MAX {
@@ -244,7 +244,7 @@ fn page() -> String {
 }
 
 /// The folder of the workspace, wherever this crate stands in it.
-fn root() -> PathBuf {
+pub(super) fn root() -> PathBuf {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     here.ancestors().find(|folder| folder.join("Cargo.lock").is_file()).expect("a workspace").to_owned()
 }

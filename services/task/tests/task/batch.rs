@@ -72,6 +72,28 @@ async fn an_item_may_depend_on_one_before_it_wherever_slices_end_but_not_on_one_
 }
 
 #[tokio::test]
+async fn an_item_of_each_form_may_ask_for_the_robot_of_one_before_it() {
+    let world = World::new().await;
+    let first = SubmitTaskRequest { task_id: "T1".into(), ..transport("r1", "B03") };
+    let mut flat = transport("r2", "B03");
+    let Some(Body::Flat(form)) = &mut flat.body else { panic!("{flat:?}") };
+    form.same_robot_as = "T1".into();
+    let content = Some(v1::NestedContent { to_waypoint: "B03".into(), ..v1::NestedContent::default() });
+    let form = v1::NestedTask {
+        task_id: "T3".into(),
+        r#type: "patrol".into(),
+        content,
+        timeout_seconds: Some(60),
+        same_robot_as: "T1".into(),
+        ..v1::NestedTask::default()
+    };
+    let nested = SubmitTaskRequest { body: Some(Body::Nested(form)), ..SubmitTaskRequest::default() };
+    let outcomes: Vec<_> = send(&world, vec![first, flat, nested]).await.expect("a batch").iter().map(shown).collect();
+    let spec = world.get(&outcomes[1]).await.spec.expect("a spec");
+    assert_eq!((spec.same_robot_as.as_str(), outcomes[2].as_str()), ("T1", "T3"));
+}
+
+#[tokio::test]
 async fn a_batch_longer_than_a_slice_is_admitted_whole_in_the_order_sent_and_can_be_sent_again() {
     let world = World::new().await;
     let items: Vec<_> = (0..limits::SUBMIT_SLICE * 2 + 1).map(|i| transport(&format!("r{i}"), "B03")).collect();

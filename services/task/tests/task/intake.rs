@@ -77,11 +77,14 @@ async fn a_task_that_depends_on_nothing_known_is_refused() {
         steps: vec![step],
         timeout: Some(prost_types::Duration { seconds: 60, nanos: 0 }),
         depends_on: vec!["TASK-UNKNOWN".into()],
+        same_robot_as: "TASK-UNKNOWN-TOO".into(),
         ..v1::TaskSpec::default()
     };
     let request = SubmitTaskRequest { body: Some(Body::Spec(spec)), ..SubmitTaskRequest::default() };
     let status = submit(&service, request).await.expect_err("it depends on nothing");
-    assert_eq!(midshift_proto::refusal_of(&status).violations[0].field, "spec.depends_on[0]");
+    let refusal = midshift_proto::refusal_of(&status);
+    let fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
+    assert_eq!(fields, ["spec.depends_on[0]", "spec.same_robot_as"]);
 }
 
 #[tokio::test]

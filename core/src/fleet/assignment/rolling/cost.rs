@@ -46,12 +46,19 @@ pub fn of_pair(policy: &PlannerPolicy, now: &Now, robot: &Robot, urgency: &Urgen
     let age_ms = now.ms_since(urgency.since);
     let eta_ms = robot.ready_ms.saturating_add(way_ms);
     let late_ms = urgency.deadline.map_or(0, |at| now.utc.plus_ms(eta_ms).ms_since(at));
+    // Together they count no more than one term may.
+    let mut left_ms = TERM_MS_MAX;
+    let mut of_way = |ms: u64| {
+        let counted = ms.min(left_ms);
+        left_ms -= counted;
+        weight * units(counted)
+    };
     let meant_ms = if pair.is_meant { policy.hysteresis_ms } else { 0 };
     PairCost {
-        ready: weight * units(robot.ready_ms),
-        way: weight * units(way_ms),
-        failed: weight * units(failed_ms),
-        charge: weight * units(robot.loss_ms),
+        ready: of_way(robot.ready_ms),
+        way: of_way(way_ms),
+        failed: of_way(failed_ms),
+        charge: of_way(robot.loss_ms),
         lateness: -units(late_ms) * i64::from(policy.lateness_permille) / 1_000,
         age: -units(age_ms) * i64::from(policy.ageing_permille) / 1_000,
         kept: -weight * units(meant_ms),

@@ -13,8 +13,8 @@ const NEXT: usize = 3;
 /// What a plan weighed, by task.
 pub struct Reasons<'a> {
     choices: &'a Choices,
-    /// Of each task its pairs.
-    of_task: BTreeMap<usize, Vec<&'a Choice>>,
+    /// Of each task that was chosen for its pairs.
+    of_task: Vec<Option<Vec<&'a Choice>>>,
     /// Of each robot the task that it goes with.
     took: BTreeMap<usize, usize>,
 }
@@ -22,16 +22,17 @@ pub struct Reasons<'a> {
 impl<'a> Reasons<'a> {
     /// Of the `pairs` that were chosen, robots with tasks.
     pub fn new(choices: &'a Choices, pairs: &[(usize, usize)]) -> Self {
-        let mut of_task: BTreeMap<usize, Vec<&Choice>> = pairs.iter().map(|(_, task)| (*task, Vec::new())).collect();
+        let mut of_task: Vec<Option<Vec<&Choice>>> = vec![None; choices.tasks.len()];
+        pairs.iter().for_each(|(_, task)| of_task[*task] = Some(Vec::new()));
         for choice in &choices.pairs {
-            of_task.entry(choice.task).and_modify(|pairs| pairs.push(choice));
+            of_task[choice.task].iter_mut().for_each(|pairs| pairs.push(choice));
         }
         Self { choices, of_task, took: pairs.iter().copied().collect() }
     }
 
     /// Why this robot for this task.
     pub fn of_task(&mut self, task: usize, robot: usize, scene: &Scene<'_>) -> PlanChoice {
-        let mut pairs = self.of_task.remove(&task).unwrap_or_default();
+        let mut pairs = self.of_task[task].take().unwrap_or_default();
         let weighed = pairs.len();
         pairs.sort_by_key(|choice| (choice.cost, choice.robot));
         let cost_of = |choice: &Choice| {
