@@ -65,7 +65,7 @@ fn promotions(since: Utc, now: Utc) -> u64 {
 /// How a task ended that others wait for.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Ended {
-    /// Terminal.
+    /// A phase that ends.
     pub phase: Phase,
     /// The robot that had it last, if any took it.
     pub robot_id: Option<RobotId>,

@@ -14,6 +14,7 @@ mod labels;
 mod leads;
 mod loads;
 mod maps;
+mod metrics;
 mod offers;
 #[path = "../../../../tests/src/old_site.rs"]
 mod old_site;

@@ -87,7 +87,7 @@ async fn an_item_of_each_form_may_ask_for_the_robot_of_one_before_it() {
         same_robot_as: "T1".into(),
         ..v1::NestedTask::default()
     };
-    let nested = SubmitTaskRequest { body: Some(Body::Nested(form)), ..SubmitTaskRequest::default() };
+    let nested = SubmitTaskRequest { body: Some(Body::Nested(form)), ..transport("r3", "B03") };
     let outcomes: Vec<_> = send(&world, vec![first, flat, nested]).await.expect("a batch").iter().map(shown).collect();
     let spec = world.get(&outcomes[1]).await.spec.expect("a spec");
     assert_eq!((spec.same_robot_as.as_str(), outcomes[2].as_str()), ("T1", "T3"));
