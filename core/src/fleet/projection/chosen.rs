@@ -1,7 +1,7 @@
 //! Why the newest plans chose the robot that they chose: what the pair cost, and the next robots with what they would have cost.
 //!
 //! `assignment::rolling` notes it from the costs that decided; the explanations read. Memory of this process: no row, and gone with a start.
-//! Invariant: of each task the newest choice, and of [`Chosen::MAX`] tasks at most.
+//! Invariant: of each task the newest choice, and of some thousand tasks at most.
 
 use crate::ids::{RobotId, TaskId};
 use crate::time::Utc;
