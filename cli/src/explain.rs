@@ -23,19 +23,19 @@ pub fn choice(choice: &PlanChoice) -> String {
     let robot = plain(&choice.robot_id);
     let at = choice.plan_time.as_ref().map_or_else(String::new, |at| format!(" at {}", time_of(at).rfc3339()));
     let chosen = format!("{} {robot}{at}", if choice.given { "given to" } else { "meant for" });
-    let mut text = format!("  {chosen}: {}\n", choice.cost.as_ref().map_or_else(String::new, cost));
+    let mut text = format!("  {chosen}: weighs {}\n", choice.cost.as_ref().map_or_else(String::new, cost));
     for next in &choice.next {
         let took = match next.task_id.as_str() {
             "" => String::new(),
             task => format!(", which went with {}", plain(task)),
         };
         let cost = next.cost.as_ref().map_or_else(String::new, cost);
-        text += &format!("  next {}: {cost}{took}\n", plain(&next.robot_id));
+        text += &format!("  next {}: would weigh {cost}{took}\n", plain(&next.robot_id));
     }
     text
 }
 
-/// A cost in seconds on the way, with the terms that are not 0.
+/// A cost in seconds on the way as they were weighed (those of a normal task count twice), with the terms that are not 0.
 fn cost(cost: &PairCost) -> String {
     let seconds = |ms: i64| format!("{:.1} s", ms as f64 / 1_000.0);
     let terms = [
@@ -93,8 +93,11 @@ mod tests {
             next: vec![next],
             ..PlanChoice::default()
         });
-        let told = "  given to r1: 10.5 s (way 12.0 s, waited -1.5 s)\n";
-        assert_eq!(said, told.to_owned() + "  next r2: 7.5 s (way 9.0 s, waited -1.5 s), which went with T2\n");
+        let told = "  given to r1: weighs 10.5 s (way 12.0 s, waited -1.5 s)\n";
+        assert_eq!(
+            said,
+            told.to_owned() + "  next r2: would weigh 7.5 s (way 9.0 s, waited -1.5 s), which went with T2\n"
+        );
     }
 
     #[test]
