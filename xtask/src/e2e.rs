@@ -24,7 +24,7 @@ use std::time::Duration;
 
 /// The test program.
 pub const NAME: &str = "e2e";
-/// Modules (`name::`) and single tests that take more than one permit of two a busy core.
+/// Modules (`name::`) and single tests that take more than one permit of five that two busy cores have.
 const HEAVY: &[(&str, usize)] = &[
     ("followed::", 2),
     ("handed_over::", 2),
@@ -149,7 +149,7 @@ struct Permits {
 
 impl Permits {
     fn new() -> Self {
-        Self { busy: threads(), idle: 3 * threads() }
+        Self { busy: threads() * 5 / 4, idle: 3 * threads() }
     }
 
     /// The first in the queue, if it has its permits beside those that are used.
