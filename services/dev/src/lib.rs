@@ -45,7 +45,7 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 use stops::Stops;
-use task_summary::Tasks;
+use task_summary::{SharedTasks, Tasks};
 use tempfile::TempDir;
 use throwaway::Throwaway;
 use tokio::net::TcpListener;
@@ -150,7 +150,7 @@ async fn play(args: Dev, stop: CancellationToken, say: Say<'_>) -> anyhow::Resul
                 &args,
                 &hall_config,
                 &hall,
-                sight,
+                (sight, tasks.clone()),
                 [address, stops.service.address()],
                 trust,
                 &software,
@@ -194,7 +194,7 @@ impl Scene {
         args: &Dev,
         config: &FleetConfig,
         hall: &Fleet,
-        sight: Sight,
+        (sight, tasks): (Sight, SharedTasks),
         [address, stops]: [SocketAddr; 2],
         trust: TrustAnchors,
         software: &Throwaway,
@@ -209,6 +209,7 @@ impl Scene {
             stop_server: stops.to_string(),
             channel: tonic::transport::Endpoint::from_shared(format!("http://{address}"))?.connect_lazy(),
             sight,
+            tasks,
             releases: args.bundles.clone(),
             watched_ms: u64::try_from(args.watched.as_millis()).unwrap_or(u64::MAX),
             no_faults: args.no_faults,

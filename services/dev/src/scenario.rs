@@ -10,11 +10,13 @@ mod watch;
 
 pub use played::Story;
 
+use crate::task_summary::{SharedTasks, read_tasks};
 use anyhow::{Context, ensure};
 use midshift_agent::switch::Switch;
 use midshift_agent::trust_anchors::TrustAnchors;
 use midshift_cli::samples::{self, Signer};
 use midshift_core::ids::{AreaId, RobotId, WaypointId};
+use midshift_core::time::Utc;
 use midshift_proto::fleet::v1::GetAreaPolicyRequest;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::ota::v1;
@@ -44,6 +46,8 @@ const START_TAKES_MS: i64 = 2_000;
 const SETTLES_WITHIN: Duration = Duration::from_secs(60);
 /// What a robot runs that may still go back.
 const ON_TRIAL: &str = "on trial";
+/// The fleet works so long before the first roll-out, real time: what it does meanwhile stands beside what it does later.
+const WORKS_BEFORE: Duration = Duration::from_secs(20);
 /// A launched robot that was asked to end has so long, real time.
 const ENDS_WITHIN: Duration = Duration::from_secs(10);
 /// A launched robot that gives no sign for so many seconds is killed by its launcher.
@@ -100,6 +104,8 @@ pub struct Stage {
     pub channel: Channel,
     /// What is looked at.
     pub sight: Sight,
+    /// Its tasks as their rows say it.
+    pub tasks: SharedTasks,
     /// What is rolled out, in this order.
     pub releases: Vec<Release>,
     /// Probation and soak of each roll-out, milliseconds of site time, which is real time here.
@@ -155,11 +161,16 @@ impl Stage {
     async fn acts(&self, say: &(dyn Fn(&str) + Sync)) -> anyhow::Result<Story> {
         self.until_at_work().await?;
         say(&format!("{} robots at work, {} of them processes of their own", self.robots(), self.launched.len()));
+        let (at_work, rest) = (self.sight.clock.now().utc, tokio::time::sleep(WORKS_BEFORE));
         self.publish().await?;
+        rest.await;
+        let before = self.per_hour(at_work);
+        say(&format!("{before:.0} tasks an hour before the first roll-out"));
         let mut story = Story {
             robots_in_process: self.in_process,
             robots_launched: self.launched.len(),
             body_speed: self.body_speed,
+            tasks_per_hour_before: before,
             acts: Vec::new(),
         };
         let watcher = Watcher::begin(self.sight.clone(), self.permille().await?);
@@ -171,6 +182,11 @@ impl Stage {
             story.acts.push(played);
         }
         Ok(story)
+    }
+
+    /// Tasks that succeeded since then, as so many an hour.
+    fn per_hour(&self, since: Utc) -> f64 {
+        read_tasks(&self.tasks, |tasks| tasks.per_hour(since, self.sight.clock.now().utc))
     }
 
     /// Starts the robots that are processes of their own: before there is work, which waits for them too.
@@ -278,7 +294,7 @@ impl Stage {
             exposure_tasks: Some(release.exposure_tasks()),
             ..v1::RolloutSpec::default()
         };
-        let begun = tokio::time::Instant::now();
+        let (begun, begun_utc) = (tokio::time::Instant::now(), self.sight.clock.now().utc);
         let id = rollout_id.clone();
         client.create_rollout(v1::CreateRolloutRequest { rollout_id: id.clone(), spec: Some(spec) }).await?;
         let (etag, reason) = (String::new(), "the story".to_owned());
@@ -291,7 +307,7 @@ impl Stage {
             .await?;
         let ended = tokio::time::timeout(LONGEST, self.until(&rollout_id, has_ended)).await;
         ended.with_context(|| format!("{rollout_id} did not end within {} s", LONGEST.as_secs()))??;
-        let wall_s = begun.elapsed().as_secs_f64();
+        let (wall_s, tasks_per_hour) = (begun.elapsed().as_secs_f64(), self.per_hour(begun_utc));
         // Its end says what every robot is to run. One that does not come to it is seen by what it runs.
         let settled = tokio::time::timeout(SETTLES_WITHIN, self.until(&rollout_id, is_settled)).await;
         let rollout = match settled {
@@ -299,7 +315,7 @@ impl Stage {
             Err(_) => self.until(&rollout_id, has_ended).await?,
         };
         let (seen, most) = watcher.seen().await;
-        self.judge(release, &rollout, &before, Played::from_seen(seen, most, wall_s)).await
+        self.judge(release, &rollout, &before, Played { tasks_per_hour, ..Played::from_seen(seen, most, wall_s) }).await
     }
 
     /// The roll-out, as soon as it is so.

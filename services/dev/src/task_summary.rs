@@ -69,6 +69,16 @@ impl Tasks {
     pub fn is_live(&self, id: &TaskId) -> bool {
         self.states.get(id).is_some_and(|(phase, _)| !phase.is_terminal())
     }
+    /// Tasks of anybody that succeeded between two moments, UTC, as so many an hour of that clock. Nothing for no time.
+    pub fn per_hour(&self, from: Utc, until: Utc) -> f64 {
+        let is_within = |ended: &Option<Utc>| ended.is_some_and(|at| from < at && at <= until);
+        let states = self.states.values();
+        let done = states.filter(|(phase, ended)| *phase == Phase::Succeeded && is_within(ended)).count();
+        match until.ms_since(from) {
+            0 => 0.0,
+            ms => done as f64 * 3_600_000.0 / ms as f64,
+        }
+    }
     /// Seconds of site time from admission to success of the run's tasks, rising.
     pub fn completions_s(&self) -> Vec<f64> {
         let took = |id: &TaskId| {

@@ -61,6 +61,7 @@ async fn a_good_release_reaches_every_robot_and_a_bad_one_ends_with_its_canary()
     assert!(told.contains(&format!("{robots} robots at work, {launched} of them processes of their own")), "{told}");
     let acts = report["story"]["acts"].as_array().context("no roll-outs")?;
     assert_eq!(acts.len(), bundles.len(), "{report}");
+    assert!(report["story"]["tasks_per_hour_before"].as_f64() > Some(0.0), "{report}");
     for (act, bundle) in acts.iter().zip(bundles) {
         let bundle = format!("walk-{bundle}: ");
         let line = told.lines().find(|l| l.starts_with(&bundle)).with_context(|| format!("no {bundle}: {told}"))?;
@@ -72,6 +73,7 @@ async fn a_good_release_reaches_every_robot_and_a_bad_one_ends_with_its_canary()
             assert!(act["abort"].is_string(), "an abort without evidence: {act}");
         } else {
             says(": COMPLETED in ");
+            assert!(act["tasks_per_hour"].as_f64() > Some(0.0), "nothing was done meanwhile: {act}");
             says(&format!(", ran on {robots} (permitted {robots}, "));
             says(&format!(", kept by {robots},"));
         }

@@ -65,6 +65,8 @@ pub struct Played {
     pub off_work: OffWork,
     /// Seconds of real time from start to end.
     pub wall_s: f64,
+    /// Tasks that succeeded from its start to its end, as so many an hour (rows).
+    pub tasks_per_hour: f64,
 }
 
 /// What the story came to.
@@ -76,6 +78,8 @@ pub struct Story {
     pub robots_launched: usize,
     /// How many times as fast as real bodies worked.
     pub body_speed: f64,
+    /// Tasks that succeeded before the first roll-out, as so many an hour (rows).
+    pub tasks_per_hour_before: f64,
     /// Its roll-outs.
     pub acts: Vec<Played>,
 }
@@ -84,10 +88,6 @@ impl Story {
     /// Why it cannot be called good; empty if it can.
     pub fn objections(&self) -> Vec<String> {
         self.acts.iter().flat_map(|act| act.objections(self.robots_in_process + self.robots_launched)).collect()
-    }
-    /// The story in lines.
-    pub fn lines(&self) -> Vec<String> {
-        self.acts.iter().flat_map(Played::lines).collect()
     }
 }
 
@@ -142,10 +142,11 @@ impl Played {
         let ms = |ms: Option<u64>| ms.map_or("-".to_owned(), |ms| format!("{:.1}", ms as f64 / 1000.0));
         let o = &self.off_work;
         let mut lines = vec![format!(
-            "{}: {} in {:.0} s, ran on {} (permitted {}, at the abort {}, begun after it {}), kept by {}, changed at once {} of {}",
+            "{}: {} in {:.0} s, {:.0} tasks an hour, ran on {} (permitted {}, at the abort {}, begun after it {}), kept by {}, changed at once {} of {}",
             self.bundle,
             self.phase,
             self.wall_s,
+            self.tasks_per_hour,
             self.robots_that_ran_it,
             self.touched,
             self.touched_at_abort.map_or("-".to_owned(), |n| n.to_string()),

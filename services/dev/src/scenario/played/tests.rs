@@ -28,6 +28,7 @@ fn played(is_good: bool) -> Played {
         abort: (!is_good).then(|| "BUNDLE_FAILS: it fails (r-1)".to_owned()),
         off_work: OffWork { parked_to_grant_ms: Some(5_000), ..OffWork::default() },
         wall_s: 60.0,
+        tasks_per_hour: 900.0,
     }
 }
 
@@ -70,8 +71,13 @@ fn each_figure_that_is_wrong_is_one_objection_that_names_it() {
 
 #[test]
 fn a_story_counts_robots_of_both_kinds_and_has_the_objections_of_all_its_roll_outs() {
-    let mut story =
-        Story { robots_in_process: 15, robots_launched: 5, body_speed: 5.0, acts: vec![played(true), played(false)] };
+    let mut story = Story {
+        robots_in_process: 15,
+        robots_launched: 5,
+        body_speed: 5.0,
+        tasks_per_hour_before: 1_000.0,
+        acts: vec![played(true), played(false)],
+    };
     assert_eq!(story.objections(), Vec::<String>::new());
     story.acts[0].kept_by = 19;
     story.acts[1].kept_by = 1;
