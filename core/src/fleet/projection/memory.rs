@@ -61,6 +61,8 @@ pub struct MeantFor {
 #[derive(Clone, Debug, Default)]
 pub struct Meant {
     named: BTreeMap<TaskId, MeantFor>,
+    /// Tasks that the newest plan means for nobody and one before it did: since when that, and when it ended, site clock.
+    dropped: BTreeMap<TaskId, (SiteTime, SiteTime)>,
     /// Tasks that were meant for too long, and until when they are meant for no robot, site clock.
     resting: BTreeMap<TaskId, SiteTime>,
 }
@@ -68,6 +70,8 @@ pub struct Meant {
 impl Meant {
     /// A task is meant for no robot for longer than this without getting one, site time; then not again for as long.
     const FOR: SiteDuration = SiteDuration::from_secs(30);
+    /// A shorter time without a robot, site time, counts as if the task had been meant for one.
+    const GAP: SiteDuration = SiteDuration::from_secs(5);
 
     /// For whom a task is meant.
     pub fn get(&self, task_id: &TaskId) -> Option<&MeantFor> {
@@ -76,26 +80,37 @@ impl Meant {
     /// Whether a task was meant for one robot or another for so long that it goes to one that is free.
     pub fn is_over(&self, task_id: &TaskId, now: SiteTime) -> bool {
         let is_resting = || self.resting.get(task_id).is_some_and(|until| now < *until);
-        self.get(task_id).map_or_else(is_resting, |meant| meant.is_over(now))
+        self.since(task_id, now).map_or_else(is_resting, |since| is_over(since, now))
     }
     /// What a plan means: tasks with their robots, and when those are free.
     pub(in crate::fleet) fn put_plan(&mut self, tasks: Vec<(TaskId, RobotId, Utc)>, now: SiteTime) {
-        let (over, before): (BTreeMap<_, _>, BTreeMap<_, _>) =
-            std::mem::take(&mut self.named).into_iter().partition(|(_, meant)| meant.is_over(now));
+        let meant: BTreeMap<TaskId, MeantFor> = tasks
+            .into_iter()
+            .map(|(task_id, robot_id, free)| {
+                let since = self.since(&task_id, now).filter(|since| !is_over(*since, now)).unwrap_or(now);
+                (task_id, MeantFor { robot_id, free, since })
+            })
+            .collect();
+        self.dropped.retain(|_, (_, ended)| now.since(*ended) < Self::GAP);
+        let before =
+            std::mem::replace(&mut self.named, meant).into_iter().map(|(task_id, meant)| (task_id, (meant.since, now)));
+        self.dropped.extend(before);
+        self.dropped.retain(|task_id, _| !self.named.contains_key(task_id));
         self.resting.retain(|_, until| now < *until);
-        self.resting.extend(over.into_keys().map(|task_id| (task_id, now + Self::FOR)));
-        let meant = |(task_id, robot_id, free): (TaskId, RobotId, Utc)| {
-            let since = before.get(&task_id).map_or(now, |meant| meant.since);
-            (task_id, MeantFor { robot_id, free, since })
-        };
-        self.named = tasks.into_iter().map(meant).collect();
+        let over = self.dropped.extract_if(.., |_, (since, _)| is_over(*since, now));
+        self.resting.extend(over.map(|(task_id, _)| (task_id, now + Self::FOR)));
+    }
+    /// Since when a task is meant for one robot or another, shorter gaps counted.
+    fn since(&self, task_id: &TaskId, now: SiteTime) -> Option<SiteTime> {
+        let is_near = |(_, ended): &&(SiteTime, SiteTime)| now.since(*ended) < Self::GAP;
+        let dropped = || self.dropped.get(task_id).filter(is_near).map(|(since, _)| *since);
+        self.named.get(task_id).map(|meant| meant.since).or_else(dropped)
     }
 }
 
-impl MeantFor {
-    fn is_over(&self, now: SiteTime) -> bool {
-        now.since(self.since) > Meant::FOR
-    }
+/// Whether a task that is meant for robots since then is so for too long.
+fn is_over(since: SiteTime, now: SiteTime) -> bool {
+    now.since(since) > Meant::FOR
 }
 
 /// What lasts, by robot and code: since when it lasts or was last seen as an open incident, link clock. Volatile.

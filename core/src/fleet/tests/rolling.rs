@@ -166,6 +166,13 @@ fn a_task_that_was_meant_for_too_long_and_found_no_robot_is_not_meant_for_one_ag
     meant.put_plan(Vec::new(), SiteTime(131_000));
     meant.put_plan(plan(), SiteTime(132_000));
     assert!(!meant.is_over(&task_id, SiteTime(162_000)) && meant.is_over(&task_id, SiteTime(163_000)));
+    // Plans between that mean it for nobody count with it, unless it was long for nobody.
+    for (s, tasks) in [(200, plan()), (220, Vec::new()), (224, plan()), (228, Vec::new())] {
+        meant.put_plan(tasks, SiteTime(s * 1_000));
+    }
+    assert!(meant.get(&task_id).is_none() && meant.is_over(&task_id, SiteTime(231_000)));
+    meant.put_plan(plan(), SiteTime(240_000));
+    assert!(!meant.is_over(&task_id, SiteTime(270_000)));
 }
 
 #[test]
