@@ -1,5 +1,6 @@
-//! Durations as people write them on a command line.
+//! Durations as people write them on a command line, and as they read them.
 
+use midshift_proto::convert::ms_of;
 use std::time::Duration;
 
 /// Reads `10m`, `90s`, `500ms`, `2h`, `90d`.
@@ -16,6 +17,17 @@ pub fn duration(text: &str) -> Result<Duration, String> {
         _ => return Err(bad()),
     };
     Duration::try_from_secs_f64(number * seconds).map_err(|_| bad())
+}
+
+/// A stretch of time: `8.0 s`, `12 min 5 s`, `3 h 20 min`.
+pub fn span(duration: &prost_types::Duration) -> String {
+    let ms = ms_of(duration).max(0);
+    let seconds = ms / 1000;
+    match seconds {
+        0..60 => format!("{}.{} s", seconds, ms % 1000 / 100),
+        60..3_600 => format!("{} min {} s", seconds / 60, seconds % 60),
+        _ => format!("{} h {} min", seconds / 3_600, seconds % 3_600 / 60),
+    }
 }
 
 #[cfg(test)]

@@ -1,12 +1,13 @@
 //! Reasons in words: of an explanation, and `midshift explain-error`: what a reason means and what to try.
 
 use super::client::Exit;
+use super::duration::span;
 use super::out::{Format, Out, plain};
 use midshift_core::fleet::WAITS_FOR;
 use midshift_core::reason::Code;
 use midshift_proto::common::v1::Reason;
-use midshift_proto::convert::time_of;
-use midshift_proto::fleet::v1::{PairCost, PlanChoice};
+use midshift_proto::convert::{duration, time_of};
+use midshift_proto::fleet::v1::{PairCost, PlanChoice, TaskExplanation};
 
 /// The lines of an explanation that say what is done or waited for; `nothing`: in case there is no reason.
 pub fn verdict(reason: Option<&Reason>, nothing: &str) -> String {
@@ -15,6 +16,19 @@ pub fn verdict(reason: Option<&Reason>, nothing: &str) -> String {
     match reason.metadata.get(WAITS_FOR).filter(|what| !what.is_empty()) {
         Some(what) => told + &format!("  waits for {}\n", plain(what)),
         None => told,
+    }
+}
+
+/// How soon a task will probably get a robot.
+pub fn expected_start(e: &TaskExplanation) -> String {
+    let left = |at: &Option<prost_types::Timestamp>| {
+        let (at, now) = at.as_ref().zip(e.explain_time.as_ref())?;
+        let ms = time_of(at).ms_since(time_of(now));
+        Some(span(&duration(ms)))
+    };
+    match left(&e.expected_start_p10_time).zip(left(&e.expected_start_p90_time)) {
+        Some((from, until)) => format!("  lately eight of ten such tasks got a robot within {from} to {until}\n"),
+        None => String::new(),
     }
 }
 

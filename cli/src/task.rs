@@ -249,6 +249,7 @@ async fn explain(one: &TaskTarget, out: &Out) -> Result<(), Exit> {
             text += &format!("  number {position} in the queue");
         }
         text += &verdict(e.verdict.as_ref(), "nothing holds it");
+        text += &super::explain::expected_start(&e);
         text += &e.choice.as_ref().map_or_else(String::new, super::explain::choice);
         let rows: Vec<Vec<String>> = e
             .candidates

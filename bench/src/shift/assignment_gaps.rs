@@ -4,6 +4,7 @@
 //! A question is a turn of the planner. So it is asked of small fleets only, whose planner has a turn at each event.
 
 use super::control_plane::ControlPlane;
+use super::expected_starts::{ExpectedStarts, StartCounts};
 use super::task_records::TaskRecords;
 use midshift_core::ids::{RobotId, TaskId};
 use midshift_proto::fleet::v1::TaskExplanation;
@@ -25,6 +26,8 @@ pub struct AssignmentGaps {
     pub named_too_long: u64,
     /// Time that robots idled beyond what they may, beside a task that they could do; summed over all, milliseconds.
     pub idle_ms: u64,
+    /// Tasks that were told when they would get a robot.
+    pub starts: StartCounts,
 }
 
 /// The watch over one fleet.
@@ -35,6 +38,7 @@ pub struct AssignmentWatch {
     named: BTreeMap<TaskId, u64>,
     idle: BTreeMap<RobotId, u64>,
     too_long: BTreeSet<TaskId>,
+    starts: ExpectedStarts,
     looked_ms: u64,
     idle_ms: u64,
 }
@@ -42,13 +46,14 @@ pub struct AssignmentWatch {
 impl AssignmentWatch {
     /// Nothing was seen yet.
     pub fn new(fleet: Arc<Fleet>, records: Arc<TaskRecords>) -> Self {
-        let (named, idle, too_long) = Default::default();
-        Self { fleet, records, named, idle, too_long, looked_ms: 0, idle_ms: 0 }
+        let (named, idle, too_long, starts) = Default::default();
+        Self { fleet, records, named, idle, too_long, starts, looked_ms: 0, idle_ms: 0 }
     }
 
     /// What was seen so far.
     pub fn gaps(&self) -> AssignmentGaps {
-        AssignmentGaps { named_too_long: self.too_long.len() as u64, idle_ms: self.idle_ms }
+        let starts = self.starts.counts(&self.records);
+        AssignmentGaps { named_too_long: self.too_long.len() as u64, idle_ms: self.idle_ms, starts }
     }
 
     /// Looks at tasks that wait and at robots that idle.
@@ -68,8 +73,12 @@ impl AssignmentWatch {
         let idle = robots.filter(|robot_id| !busy.contains(*robot_id));
         self.idle = idle.map(|id| (id.clone(), self.idle.get(id).copied().unwrap_or(now_ms))).collect();
         let mut named = BTreeMap::new();
-        for explained in plane.explain_tasks(waiting.keys()).await?.iter().filter(|explained| is_named(explained)) {
+        for explained in &plane.explain_tasks(waiting.keys()).await? {
             let task_id = TaskId::parse(&explained.task_id)?;
+            self.starts.note_told(&task_id, explained, now_ms);
+            if !is_named(explained) {
+                continue;
+            }
             let since = self.named.get(&task_id).copied().unwrap_or(now_ms);
             named.insert(task_id, since);
         }

@@ -7,6 +7,7 @@
 //!    with its time so far: without it the longest would be left out.
 //! 3. What there is nothing to measure of is left out.
 
+use super::expected_starts::StartCounts;
 use super::run::Outcome;
 use super::scenario::{BATTERY_RATES, BodyFaults};
 use super::task_records::TaskRecord;
@@ -162,6 +163,13 @@ fn add_robots(told: &mut Measures, outcome: &Outcome) {
         told.add("named for a soon-free robot longer than 30 s", "tasks", too_long);
         let idle_min = (end.idle_ms - begin.idle_ms) as f64 / 60_000.0;
         told.add("idle > 5 s beside a task named for nobody", "robot-min", idle_min);
+        let starts = |of: fn(&StartCounts) -> u64| (of(&end.starts) - of(&begin.starts)) as f64;
+        let of_told = |count: f64| 100.0 * count / starts(|s| s.told);
+        if starts(|s| s.told) > 0.0 {
+            told.add("tasks told when they would get a robot", "tasks", starts(|s| s.told));
+            told.add("got it within the P10-P90 that they were told", "%", of_told(starts(|s| s.within)));
+            told.add("got it before", "%", of_told(starts(|s| s.early)));
+        }
     }
     let stood = |time: Duration| time.as_secs_f64() / 60.0;
     let (begin, end) = (outcome.begin.no_progress, outcome.end.no_progress);

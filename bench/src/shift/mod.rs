@@ -12,7 +12,7 @@
 //!
 //! Modules, from the lowest to the highest: `background_task`, `clock`, `task_records`, `plan_log`, `link`, `robot`,
 //! `control_plane`, `chargers`, `floor`, `operator`, `breakers`, `lost_robots`, `workload`, `scenario`, `progress`,
-//! `assignment_gaps`, `watches`, `run`, `measures`, `comparison`, `chart`, `options`.
+//! `expected_starts`, `assignment_gaps`, `watches`, `run`, `measures`, `comparison`, `chart`, `options`.
 
 mod assignment_gaps;
 mod background_task;
@@ -22,6 +22,7 @@ mod chart;
 mod clock;
 mod comparison;
 mod control_plane;
+mod expected_starts;
 mod floor;
 mod link;
 mod lost_robots;

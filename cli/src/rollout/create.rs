@@ -4,6 +4,7 @@ use super::commands::{begin, show};
 use super::parse::{pair, rate, wave};
 use super::text;
 use crate::client::{Call, Exit, unary};
+use crate::duration::span;
 use crate::out::{Out, columns};
 use clap::ValueEnum;
 use midshift_proto::ota::v1;
@@ -244,7 +245,7 @@ pub fn describe_plan(rollout_id: &str, waves: &[v1::RolloutWave], plan: &v1::Pla
     if more > 0 {
         lines.push(format!("    and {more} more; all of them with -o json"));
     }
-    let least = plan.least.as_ref().map(text::span).unwrap_or_default();
+    let least = plan.least.as_ref().map(span).unwrap_or_default();
     lines.push(format!("  each robot fetches at most {} bytes; it takes {least} of site time at least", plan.bytes));
     lines.extend(plan.caveats.iter().map(|caveat| format!("  mind: {caveat}")));
     let kinds: Vec<Vec<String>> = plan.strata.iter().map(kind).collect();

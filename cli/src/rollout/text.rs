@@ -3,6 +3,7 @@
 //! Invariant: pure functions of messages; nothing is asked of a server here, and no clock is read. Waves are counted from 1 for people, as
 //! `wave 1/3`; on the wire from 0.
 
+use crate::duration::span;
 use crate::out::plain;
 use midshift_proto::common::v1::Reason;
 use midshift_proto::convert::{ms_of, time_of};
@@ -16,17 +17,6 @@ const ROBOTS_SHOWN: usize = 12;
 /// A moment as people read it; nothing for none.
 pub fn time(at: Option<&Timestamp>) -> String {
     at.map(|t| time_of(t).rfc3339()).unwrap_or_default()
-}
-
-/// A stretch of time: `8.0 s`, `12 min 5 s`, `3 h 20 min`.
-pub fn span(duration: &Duration) -> String {
-    let ms = ms_of(duration).max(0);
-    let seconds = ms / 1000;
-    match seconds {
-        0..60 => format!("{}.{} s", seconds, ms % 1000 / 100),
-        60..3_600 => format!("{} min {} s", seconds / 60, seconds % 60),
-        _ => format!("{} h {} min", seconds / 3_600, seconds % 3_600 / 60),
-    }
 }
 
 /// Permille as percent with one digit.

@@ -172,6 +172,8 @@ pub fn task_explanation(task_id: &TaskId, e: &TaskExplanation, now: Utc) -> v1::
             .map(|(code, n)| v1::FilterCount { code: code.as_str().to_owned(), robots: *n as u32 })
             .collect(),
         expected_start_time: e.expected.map(timestamp),
+        expected_start_p10_time: e.start.map(|start| timestamp(start.p10)),
+        expected_start_p90_time: e.start.map(|start| timestamp(start.p90)),
         explain_time: Some(timestamp(now)),
         choice: e.choice.as_ref().map(plan_choice),
     }

@@ -8,7 +8,7 @@ use crate::fleet::projection::index::advance;
 use crate::fleet::projection::queue::{TASKS_PER_TURN, Wait};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::transitions::{News, apply_event};
-use crate::fleet::tasks::{eligibility, timers};
+use crate::fleet::tasks::{eligibility, place_breaker, timers};
 use crate::ids::TaskId;
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -27,6 +27,7 @@ pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut 
         ask_person(view, now, &task_id, why.as_ref(), plan);
     }
     let moved: Vec<TaskId> = view.queue.moved.iter().take(TASKS_PER_TURN).cloned().collect();
+    let mut began = Vec::new();
     for task_id in moved {
         if plan.is_cut() {
             return;
@@ -41,8 +42,19 @@ pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut 
             timers::count_readiness(tx, &task_id);
         });
         view.queue.moved.remove(&task_id);
+        began.push(task_id);
     }
+    place_breaker::choose_tries(view, now.utc);
+    reckon_starts(view, now, &began);
     check_robots(view, now, plan);
+}
+
+/// Notes of some tasks that began to be ready, and of some that are for long, where they stand.
+fn reckon_starts(view: &mut FleetProjection, now: Now, began: &[TaskId]) {
+    for task_id in view.starts.pick_tasks(began.iter(), now.utc) {
+        let Some((position, rank)) = view.queue.position(&task_id).zip(view.queue.rank(&task_id)) else { continue };
+        view.starts.reckon_task(&task_id, position, rank.since, now.utc);
+    }
 }
 
 /// Ends ready tasks that a newer one with the same key replaces, but those that others wait for. What they had waited for already counts for the

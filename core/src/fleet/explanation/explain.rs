@@ -7,6 +7,7 @@ use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::facts::misreads;
 use crate::fleet::projection::chosen::PlanChoice;
 use crate::fleet::projection::liveness::Board;
+use crate::fleet::projection::starts::StartEstimate;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::load;
 use crate::fleet::traffic::{closed_places, routing};
@@ -42,8 +43,10 @@ pub struct TaskExplanation {
     pub candidates: Vec<RobotCandidate>,
     /// Robots by the first reason against them.
     pub filtered: BTreeMap<Code, u64>,
-    /// UTC, when its robot will be free; now, if as many are eligible as tasks go before it. None: nobody can tell.
+    /// UTC, when its robot will be free; now, if as many are eligible as tasks go before it; else the middle of `start`. None: nobody can tell.
     pub expected: Option<Utc>,
+    /// Between when and when tasks got a robot lately that stood as it does. None: it is not ready, or too few did.
+    pub start: Option<StartEstimate>,
     /// Why the newest plan that gave it to a robot, or meant it for one, chose that robot. None: none did, or that is forgotten.
     pub choice: Option<PlanChoice>,
 }
@@ -92,7 +95,10 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
     let eligible_ones = candidates.iter().filter(|c| c.reason.is_none()).count();
     let is_next = position.is_some_and(|position| position <= eligible_ones);
     let meant = wait_reasons::meant_for(view, now, task);
+    let start = view.queue.rank(task_id).zip(position);
+    let start = start.and_then(|(rank, position)| view.starts.estimate(position, rank.since, now.utc));
     let expected = meant.map(|meant| meant.free.max(now.utc)).or_else(|| is_next.then_some(now.utc));
+    let expected = expected.or_else(|| start.map(|start| start.p50));
     candidates.truncate(CANDIDATES_MAX);
     let code = if eligible { Code::WaitingInQueue } else { Code::WaitingForRobot };
     let turn = || {
@@ -106,7 +112,7 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
     let verdict = verdict.or_else(|| task.reason.clone());
     let expected = expected.filter(|_| position.is_some());
     let choice = view.chosen.get(task_id).cloned();
-    Some(TaskExplanation { position, verdict, candidates, filtered, expected, choice })
+    Some(TaskExplanation { position, verdict, candidates, filtered, expected, start, choice })
 }
 
 /// Why each robot with a session gets no work, looked at once for all explanations of a turn.
@@ -136,7 +142,7 @@ pub fn unknown(reason: Reason) -> TaskExplanation {
 
 fn only(verdict: Option<Reason>) -> TaskExplanation {
     let (candidates, filtered) = (Vec::new(), BTreeMap::new());
-    TaskExplanation { position: None, verdict, candidates, filtered, expected: None, choice: None }
+    TaskExplanation { position: None, verdict, candidates, filtered, expected: None, start: None, choice: None }
 }
 
 /// The robot that a task waits for, and what keeps that one.

@@ -73,6 +73,12 @@ fn queued(view: &FleetProjection, board: &Board, now: &Now, task: &TaskState, in
         let told = format!("robot {}: it is free soon and nearer than others", meant.robot_id);
         return Some(Reason::from(Code::WaitingForRobot).with(WAITS_FOR, told));
     };
+    if why.code == Code::PlaceBroken {
+        let told = |name| why.metadata.get(name).cloned().unwrap_or_default();
+        let close = format!("a person: midshift incident close {} --reason TEXT", told("incident_id"));
+        let waits_for = format!("a try from {} on, or {close}", told("again_time"));
+        return Some(why.with(WAITS_FOR, waits_for));
+    }
     let what = match Wait::of_task(task, intake, &view.ended, now.utc) {
         // What a person can end is told before what passes by itself.
         _ if task.held_by_person().is_some() => return held_by_person(task),

@@ -67,7 +67,12 @@ impl Indexed<AreaPolicy> for FleetProjection {
 
 impl Indexed<Incident> for FleetProjection {
     /// A person has looked: what was put aside is tried again.
-    fn changed(view: &mut Self, id: &str, _old: Option<&Incident>) {
+    fn changed(view: &mut Self, id: &str, old: Option<&Incident>) {
+        let new = view.incidents.get(id).map(|i| &i.row);
+        if let Some(at) = view.broken_steps.put_incident(old, new) {
+            view.steps_failed.forget(&at);
+            show_again(view);
+        }
         if let Some(closed) = view.incidents.get(id).map(|i| &i.row).filter(|i| i.closed.is_some()) {
             view.refused.incident_closed(&closed.reason);
         }
@@ -197,12 +202,25 @@ pub(in crate::fleet) fn put_in_queue(view: &mut FleetProjection, task_id: &TaskI
         is_ready = matches!(wait, Wait::Turn(_) | Wait::Mark);
         (wait, task.queued_since)
     });
+    if view.queue.rank(task_id).is_some() && !is_ready {
+        let is_given = view.task(task_id).is_some_and(|task| task.phase == Phase::Assigned);
+        match is_given {
+            true => view.starts.note_start(task_id, view.queue.now),
+            false => view.starts.forget_task(task_id),
+        }
+    }
     view.queue.set_wait(task_id, wait);
     let rows = view.tasks.get(task_id.as_str()).map(|t| &t.row).zip(view.intakes.get(task_id.as_str()).map(|i| &i.row));
     view.same_key.put_task(task_id, rows.filter(|_| is_ready), &view.site);
     if view.ready.put_task(task_id, view.queue.rank(task_id), rows, |goal| view.site.find(goal)) {
         view.queue.show_again(task_id);
     }
+}
+
+/// What kept tasks from robots is over: robots that passed them over look again.
+fn show_again(view: &mut FleetProjection) {
+    let ready: Vec<TaskId> = view.queue.ready().cloned().collect();
+    ready.iter().for_each(|task_id| view.queue.show_again(task_id));
 }
 
 /// A task has ended: those that depend on it, if there are any, wait for the next thing, or for nothing more.

@@ -2,6 +2,7 @@
 //!
 //! Every room of `fleet` reads it. Rows come in by `loading`; `index` keeps what is derived.
 
+use super::broken_steps::{BrokenSteps, StepMemory};
 use super::chosen::Chosen;
 use super::memory::{Agenda, AttachedTime, Lasting, Meant, UnansweredOffers, Unexplained, Waiting};
 use super::queue::{Ended, Queue};
@@ -12,6 +13,7 @@ use super::rows::{
     RobotCounter, RobotHolder, ServiceClock, SiteRow, Timer,
 };
 use super::same_key::SameKey;
+use super::starts::Starts;
 use crate::desired_state::{DesiredPolicy, DesiredWork};
 use crate::drain_request::{DrainRelease, DrainRequest};
 use crate::fleet::bugs::Bugs;
@@ -111,6 +113,10 @@ projection! {
         meant: Meant = Meant::default();
         /// Why tasks went to the robots that they went to.
         chosen: Chosen = Chosen::default();
+        /// How soon ready tasks got a robot lately.
+        starts: Starts = Starts::default();
+        /// Which robots failed a step at a place lately, and which task tries it again.
+        steps_failed: StepMemory = StepMemory::default();
         /// Tasks that gave way to an urgent one, and when, site clock.
         gave_way: BTreeMap<TaskId, crate::time::SiteTime> = BTreeMap::new();
         /// What stands without a reason.
@@ -139,6 +145,8 @@ projection! {
         agenda: Agenda = Agenda::default();
         /// How tasks ended that a task waits for which has not.
         ended: BTreeMap<TaskId, Ended> = BTreeMap::new();
+        /// Steps that no robot is sent to do at one place.
+        broken_steps: BrokenSteps = BrokenSteps::default();
         /// Ready tasks with a coalesce key.
         same_key: SameKey = SameKey::default();
         /// How many tasks that have not ended wait for a task.

@@ -3,7 +3,7 @@
 //! Called by every room that has news of a task. Invariant: only here does a task change its phase, and only by
 //! `task::machine::next`.
 
-use super::{arrivals, attempts, breaker, eligibility, load, plausible};
+use super::{arrivals, attempts, breaker, eligibility, load, place_breaker, plausible};
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::{HolderState, RobotAuthority, RobotCounter, RobotHolder, Timer, TimerKind};
 use crate::fleet::projection::state::FleetProjection;
@@ -209,6 +209,9 @@ pub fn end_attempt(tx: &mut Tx, a: &mut Attempt) {
     if a.phase == AttemptPhase::Failed && robots_fault {
         breaker::trip(tx, &a.robot_id);
     }
+    if a.phase == AttemptPhase::Failed {
+        place_breaker::note_failure(tx, a);
+    }
 }
 
 fn count(tx: &mut Tx, a: &Attempt) {
@@ -312,7 +315,11 @@ fn move_task(tx: &mut Tx, mut t: TaskState, a: Option<&Attempt>, step: Next, new
     t.changed = tx.now.utc;
     if let Some(report) = news.report {
         let proven = a.map(|a| arrivals::proven(tx.view, &tx.now, a, &intake.spec.steps, report.step_index));
+        let before = t.next_step;
         t.next_step = t.next_step.max(proven.unwrap_or(report.step_index));
+        let is_all = t.phase == Phase::Succeeded;
+        let done = before..if is_all { intake.spec.steps.len() as u32 } else { t.next_step };
+        place_breaker::note_done(tx, &t, intake, done);
         if report.opened {
             t.opened_robot_id = t.robot_id.clone();
         }

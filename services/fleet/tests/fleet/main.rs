@@ -19,6 +19,7 @@ mod offers;
 #[path = "../../../../tests/src/old_site.rs"]
 mod old_site;
 mod people;
+mod place_breaker;
 mod places;
 mod planner;
 mod projection;

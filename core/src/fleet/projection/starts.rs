@@ -1,0 +1,202 @@
+//! When a ready task will get a robot, as far as tasks tell that got one lately: from its place in the queue and from how fast robots
+//! are given away, with the spread that such reckonings had.
+//!
+//! A sample of the ready tasks is noted as it comes and again while it waits; once such a task is given, what was reckoned for it
+//! stands beside how long it took. Memory of this process: no row, no promise, and gone with a start. Nothing is decided by it.
+
+use crate::ids::TaskId;
+use crate::time::Utc;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+/// Tasks that are noted at once.
+const TICKETS_MAX: usize = 512;
+/// Tasks that are noted anew in one turn: looking for their places costs.
+const TICKETS_PER_TURN: usize = 8;
+/// Starts that the pace is taken of.
+const STARTS_MAX: usize = 256;
+/// Older starts say nothing of the pace, milliseconds.
+const STARTS_FOR_MS: u64 = 600_000;
+/// With fewer starts, or fewer reckonings, nothing is told.
+const LEAST: usize = 16;
+/// Reckonings that are remembered of each age.
+const RECKONED_MAX: usize = 256;
+/// A task is noted again when it has waited so long, milliseconds, then twice as long more, and so on.
+const AGAIN_MS: u64 = 10_000;
+/// A shorter wait than this is reckoned as this, milliseconds: ratios of nothing say nothing.
+const SHORTEST_MS: u64 = 500;
+
+/// Between when and when a task will probably get a robot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct StartEstimate {
+    /// UTC: a tenth of such tasks got one before.
+    pub p10: Utc,
+    /// UTC: half of them did.
+    pub p50: Utc,
+    /// UTC: nine tenths of them did.
+    pub p90: Utc,
+}
+
+/// What was reckoned of a task at one moment.
+#[derive(Clone, Copy, Debug)]
+struct Reckoned {
+    at: Utc,
+    age: usize,
+    usual_ms: u64,
+}
+
+/// What was given lately, and of some tasks that wait what was reckoned.
+#[derive(Clone, Debug, Default)]
+pub struct Starts {
+    /// When tasks got a robot, the newest last.
+    given: VecDeque<Utc>,
+    tickets: BTreeMap<TaskId, Vec<Reckoned>>,
+    /// When tasks with a ticket are reckoned again.
+    due: BTreeSet<(Utc, TaskId)>,
+    /// By how long tasks had waited then: how long they waited on, thousandths of what was reckoned.
+    ratios: Vec<VecDeque<u64>>,
+}
+
+impl Starts {
+    /// A ready task got a robot.
+    pub(in crate::fleet) fn note_start(&mut self, task_id: &TaskId, now: Utc) {
+        self.given.push_back(now);
+        if self.given.len() > STARTS_MAX {
+            self.given.pop_front();
+        }
+        for Reckoned { at, age, usual_ms } in self.tickets.remove(task_id).into_iter().flatten() {
+            if self.ratios.len() <= age {
+                self.ratios.resize(age + 1, VecDeque::new());
+            }
+            let ratios = &mut self.ratios[age];
+            ratios.push_back(now.ms_since(at) * 1_000 / usual_ms);
+            if ratios.len() > RECKONED_MAX {
+                ratios.pop_front();
+            }
+        }
+    }
+
+    /// A task waits for a robot no more, and got none.
+    pub(in crate::fleet) fn forget_task(&mut self, task_id: &TaskId) {
+        self.tickets.remove(task_id);
+    }
+
+    /// Tasks to reckon in this turn: some of those that are `new`, and those that have waited for long.
+    pub(in crate::fleet) fn pick_tasks<'t>(
+        &mut self,
+        new: impl ExactSizeIterator<Item = &'t TaskId>,
+        now: Utc,
+    ) -> Vec<TaskId> {
+        let room = TICKETS_MAX.saturating_sub(self.tickets.len()).min(TICKETS_PER_TURN);
+        let every = new.len().div_ceil(room.max(1)).max(1);
+        let mut picked: Vec<TaskId> = new.step_by(every).take(room).cloned().collect();
+        while let Some((at, task_id)) =
+            self.due.first().filter(|(at, _)| *at <= now && picked.len() < 2 * TICKETS_PER_TURN).cloned()
+        {
+            self.due.remove(&(at, task_id.clone()));
+            picked.extend(self.tickets.contains_key(&task_id).then_some(task_id));
+        }
+        picked
+    }
+
+    /// Notes where a ready task stands that is ready since then.
+    pub(in crate::fleet) fn reckon_task(&mut self, task_id: &TaskId, position: usize, since: Utc, now: Utc) {
+        let Some(usual_ms) = self.usual_ms(position, now) else { return };
+        let age = age_of(now.ms_since(since));
+        let ticket = self.tickets.entry(task_id.clone()).or_default();
+        if ticket.last().is_none_or(|last| last.age < age) {
+            ticket.push(Reckoned { at: now, age, usual_ms });
+        }
+        self.due.insert((since.plus_ms(AGAIN_MS * ((2 << age) - 1)), task_id.clone()));
+    }
+
+    /// When the task at this position, ready since then, will probably get a robot. None: too little is known.
+    pub fn estimate(&self, position: usize, since: Utc, now: Utc) -> Option<StartEstimate> {
+        let usual_ms = self.usual_ms(position, now)?;
+        let of_age = self.ratios.get(age_of(now.ms_since(since))).filter(|ratios| ratios.len() >= LEAST);
+        let mut ratios: Vec<u64> = match of_age {
+            Some(ratios) => ratios.iter().copied().collect(),
+            None => self.ratios.iter().flatten().copied().collect(),
+        };
+        if ratios.len() < LEAST {
+            return None;
+        }
+        ratios.sort_unstable();
+        let at =
+            |percent: usize| now.plus_ms(ratios[(ratios.len() - 1) * percent / 100].saturating_mul(usual_ms) / 1_000);
+        Some(StartEstimate { p10: at(10), p50: at(50), p90: at(90) })
+    }
+
+    /// How long the task at this position would wait if they were served in order and as fast as lately, milliseconds.
+    fn usual_ms(&self, position: usize, now: Utc) -> Option<u64> {
+        let lately = self.given.iter().filter(|at| now.ms_since(**at) < STARTS_FOR_MS);
+        let (count, first) = (lately.clone().count(), lately.copied().next()?);
+        (count >= LEAST).then(|| (position as u64 * now.ms_since(first) / count as u64).max(SHORTEST_MS))
+    }
+}
+
+/// How often a task has been noted again that has waited so long.
+fn age_of(waited_ms: u64) -> usize {
+    (waited_ms / AGAIN_MS + 1).ilog2() as usize
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn task(n: u64) -> TaskId {
+        TaskId::parse(&format!("T{n}")).expect("an id")
+    }
+
+    /// A robot is given away each second; each task stands at 30 when it comes, and waits `wait_s(n)`.
+    fn after(tasks: u64, wait_s: impl Fn(u64) -> u64) -> (Starts, Utc) {
+        let mut starts = Starts::default();
+        for s in 0..tasks {
+            let now = Utc(1_000 * s as i64);
+            for picked in starts.pick_tasks([task(s)].iter(), now) {
+                let since: i64 = picked.as_str()[1..].parse().expect("a number");
+                starts.reckon_task(&picked, 30, Utc(1_000 * since), now);
+            }
+            starts.note_start(&task(1_000_000 + s), now);
+            (0..tasks).filter(|n| n + wait_s(*n) == s).for_each(|n| starts.note_start(&task(n), now));
+        }
+        (starts, Utc(1_000 * tasks as i64))
+    }
+
+    #[test]
+    fn an_estimate_has_the_spread_of_those_before() {
+        let (starts, now) = after(600, |n| 20 + n % 11);
+        let told = starts.estimate(30, now, now).expect("enough is known");
+        let s = |at: Utc| at.ms_since(now) as f64 / 1_000.0;
+        assert!((19.0..24.0).contains(&s(told.p10)) && (28.0..33.0).contains(&s(told.p90)), "{told:?}");
+        assert!(told.p10 < told.p50 && told.p50 < told.p90);
+        let twice = starts.estimate(60, now, now).expect("enough is known");
+        assert_eq!(twice.p90.ms_since(now).div_ceil(2), told.p90.ms_since(now));
+    }
+
+    #[test]
+    fn who_has_waited_for_long_is_told_of_those_that_had_too() {
+        let (starts, now) = after(600, |n| if n % 4 == 0 { 100 } else { 5 });
+        let told = |waited_s: i64| starts.estimate(30, Utc(now.0 - 1_000 * waited_s), now).expect("enough is known");
+        assert!(told(0).p50.ms_since(now) < 10_000, "most wait 5 s");
+        assert!(told(40).p10.ms_since(now) > 30_000, "those that waited 40 s are of the other kind: {:?}", told(40));
+    }
+
+    #[test]
+    fn without_enough_to_go_by_nothing_is_told() {
+        let (starts, now) = after(10, |_| 5);
+        assert_eq!(starts.estimate(1, now, now), None);
+        let (starts, now) = after(600, |_| 5);
+        assert!(starts.estimate(1, now, now).is_some());
+        assert_eq!(starts.estimate(1, now, now.plus_ms(2 * STARTS_FOR_MS)), None, "nothing was given lately");
+    }
+
+    #[test]
+    fn a_flood_of_tasks_is_sampled_from_its_beginning_to_its_end() {
+        let mut starts = Starts::default();
+        let many: Vec<TaskId> = (10_000..20_000).map(task).collect();
+        let picked = starts.pick_tasks(many.iter(), Utc(0));
+        assert!(
+            picked.len() <= TICKETS_PER_TURN && picked[0] == many[0] && *picked.last().expect("some") > many[8_000]
+        );
+    }
+}
