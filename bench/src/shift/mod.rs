@@ -101,7 +101,7 @@ impl Shifts<'_> {
         if !self.args.workload.iter().any(|workload| workload.needs_saturated_rate()) {
             return rates;
         }
-        for seed in 1..=self.args.seeds() {
+        for seed in self.args.seeds() {
             match run::run(&self.args.saturated(floor, seed)) {
                 Ok(outcome) => {
                     rates.insert(seed, measures::tasks_per_hour(&outcome));
@@ -127,7 +127,7 @@ impl Shifts<'_> {
     ) {
         let (mut outcomes, mut by_seed) = (Vec::new(), BTreeMap::new());
         let (mut title, mut scenario_name) = (String::new(), "");
-        for seed in (1..=self.args.seeds()).take(workload.seeds_max()) {
+        for seed in self.args.seeds().take(workload.seeds_max()) {
             let per_hour = saturated.get(&seed).copied();
             let load = self.args.load(per_hour.unwrap_or_default());
             let scenario = workload.scenarios(load, self.args.lasts()).swap_remove(nth);
@@ -159,7 +159,10 @@ impl Shifts<'_> {
     }
 }
 
-/// What was planned, and what was left at the end.
+/// Broken rules of one shift that are told.
+const BROKEN_TOLD: usize = 8;
+
+/// What was planned, what was left at the end, and which rules were broken.
 fn describe_end(title: &str, seed: u64, outcome: &Outcome) -> String {
     let list = |counts: Vec<String>| if counts.is_empty() { "none".to_owned() } else { counts.join(", ") };
     let open =
@@ -167,5 +170,7 @@ fn describe_end(title: &str, seed: u64, outcome: &Outcome) -> String {
     let robots = outcome.verdicts.iter().map(|(code, n)| format!("{n} {code}").trim_end().to_owned());
     let PlansNoted { hash, items, .. } = outcome.end.plans;
     let (open, robots) = (list(open.collect()), list(robots.collect()));
-    format!("{title}, seed {seed}: plans {hash:016x}, {items} items; open tasks: {open}; robots: {robots}")
+    let told = format!("{title}, seed {seed}: plans {hash:016x}, {items} items; open tasks: {open}; robots: {robots}");
+    let broken = outcome.end.bodies.verdict.findings.iter().take(BROKEN_TOLD);
+    broken.fold(told, |told, finding| format!("{told}\n  broken: {finding}"))
 }

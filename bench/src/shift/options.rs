@@ -11,6 +11,7 @@ use anyhow::ensure;
 use clap::builder::RangedU64ValueParser;
 use midshift_core::limits;
 use midshift_proto::fleet::v1::{AssignmentPolicy, PlannerPolicy};
+use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
@@ -71,9 +72,12 @@ pub struct ShiftArgs {
     /// What a task gains under `rolling` by each second that it has waited, in thousandths of a second on the way.
     #[arg(long)]
     ageing_permille: Option<u32>,
-    /// Runs, each with the next seed from 1; W8 runs once.
+    /// Runs, each with the next seed; W8 runs once.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..))]
     seeds: u64,
+    /// Seed of the first run.
+    #[arg(long, default_value_t = 1)]
+    from: u64,
     /// What is asked of the fleet.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "w2")]
     pub workload: Vec<Workload>,
@@ -133,9 +137,9 @@ impl ShiftArgs {
         Duration::from_secs_f64(if self.quick { QUICK.0 } else { self.hours } * 3_600.0)
     }
 
-    /// How many seeds.
-    pub fn seeds(&self) -> u64 {
-        if self.quick { QUICK.1 } else { self.seeds }
+    /// Seeds of its runs.
+    pub fn seeds(&self) -> Range<u64> {
+        self.from..self.from.saturating_add(if self.quick { QUICK.1 } else { self.seeds })
     }
 
     /// Where it takes place.
@@ -207,7 +211,7 @@ impl ShiftArgs {
         let values = [
             ("hours", "h", self.lasts().as_secs_f64() / 3_600.0),
             ("robots", "1", self.robots as f64),
-            ("seeds", "1", self.seeds() as f64),
+            ("seeds", "1", self.seeds().count() as f64),
             ("link, one way", "ms", self.link_ms as f64),
             ("turn of the planner", "ms", self.plan_ms as f64),
         ];
