@@ -62,7 +62,7 @@ impl PlannerPolicy {
             urgent_travel_weight: 4,
             normal_travel_weight: 2,
             background_travel_weight: 1,
-            ageing_permille: 100,
+            ageing_permille: 200,
             lateness_permille: 500,
             hysteresis_ms: 5_000,
         }

@@ -52,7 +52,7 @@ impl AssignmentWatch {
 
     /// What was seen so far.
     pub fn gaps(&self) -> AssignmentGaps {
-        let starts = self.starts.counts(&self.records);
+        let starts = self.starts.counts(&self.records, self.looked_ms);
         AssignmentGaps { named_too_long: self.too_long.len() as u64, idle_ms: self.idle_ms, starts }
     }
 

@@ -8,17 +8,17 @@ use midshift_proto::fleet::v1::TaskExplanation;
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 
-/// What was told.
+/// What the planner told of tasks that wait.
 #[derive(Clone, Debug, Default)]
 pub struct ExpectedStarts {
     /// Between when and when, of each task that was told something, milliseconds since the beginning.
     told: BTreeMap<TaskId, RangeInclusive<u64>>,
 }
 
-/// What came of it.
+/// What came of what was told.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct StartCounts {
-    /// Tasks that got a robot and had been told when.
+    /// Tasks that had been told when they would get a robot, and did or should have.
     pub told: u64,
     /// Of those, within the two moments.
     pub within: u64,
@@ -35,13 +35,14 @@ impl ExpectedStarts {
         self.told.entry(task_id.clone()).or_insert_with(|| since_begin(p10)..=since_begin(p90));
     }
 
-    /// What came of those that got a robot.
-    pub fn counts(&self, records: &TaskRecords) -> StartCounts {
+    /// What came of it until now.
+    pub fn counts(&self, records: &TaskRecords, now_ms: u64) -> StartCounts {
         let mut counts = StartCounts::default();
         for (told, assigned_ms) in records.assigned(&self.told) {
-            counts.told += 1;
-            counts.within += u64::from(told.contains(&assigned_ms));
-            counts.early += u64::from(assigned_ms < *told.start());
+            let is_over = assigned_ms.is_some() || now_ms > *told.end();
+            counts.told += u64::from(is_over);
+            counts.within += u64::from(assigned_ms.is_some_and(|at| told.contains(&at)));
+            counts.early += u64::from(assigned_ms.is_some_and(|at| at < *told.start()));
         }
         counts
     }

@@ -201,11 +201,11 @@ impl TaskRecords {
         self.lock().tasks.get(task_id).is_some_and(|task| !over(task.phase))
     }
 
-    /// When each of these tasks that got a robot got its first one, milliseconds since the beginning, beside what stands for it.
-    pub fn assigned<'t, T>(&self, of: &'t BTreeMap<TaskId, T>) -> Vec<(&'t T, u64)> {
+    /// When each of these tasks got its first robot, if any, milliseconds since the beginning, beside what stands for it.
+    pub fn assigned<'t, T>(&self, of: &'t BTreeMap<TaskId, T>) -> Vec<(&'t T, Option<u64>)> {
         let records = self.lock();
-        let assigned = |task_id| records.tasks.get(task_id)?.assigned_ms;
-        of.iter().filter_map(|(task_id, what)| Some((what, assigned(task_id)?))).collect()
+        let assigned = |task_id| records.tasks.get(task_id).and_then(|task| task.assigned_ms);
+        of.iter().map(|(task_id, what)| (what, assigned(task_id))).collect()
     }
 
     /// Every task, in the order of its id.

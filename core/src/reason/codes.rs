@@ -370,7 +370,7 @@ codes! {
     TaskBacklog = "TASK_BACKLOG", "Ready tasks wait for a robot for more than an hour. It closes by itself. `midshift task ls --state queued` lists them.";
     RobotBreakerOpened = "ROBOT_BREAKER_OPENED", "A robot failed three attempts in ten minutes, and gets no work."
         => "Look at it, then `midshift robot uncordon ROBOT`.";
-    PlaceBroken = "PLACE_BROKEN", "Three robots failed this step at this place within ten minutes, so no more are sent there for it. After ten minutes one task tries, and its success closes the incident."
+    PlaceBroken = "PLACE_BROKEN", "Three robots failed this action at this place within ten minutes, so no more are sent there for it. After ten minutes one task is let through as a probe, and its success closes the incident."
         => "Look there, put it right, then `midshift incident close INCIDENT --reason TEXT`.";
     PlaceQuarantined = "PLACE_QUARANTINED", "A place, or a seat of it, is kept closed until the robot that may be inside reports or a person clears it."
         => "Look there, then `midshift zone clear PLACE --reason TEXT --if-match ETAG`; `midshift zone ls` shows the ETAG.";

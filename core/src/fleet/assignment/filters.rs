@@ -5,11 +5,10 @@
 use super::demand::Demand;
 use crate::fleet::facts::{disbelief, maps, repair, unanswered_offers};
 use crate::fleet::projection::liveness::{self, Board};
-use crate::fleet::projection::queue::Wait;
 use crate::fleet::projection::rows::RobotHolder;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::eligibility::{another_could, bound, decided_by_people, fits, reported};
-use crate::fleet::tasks::{claims, load, place_breaker, plausible};
+use crate::fleet::tasks::{claims, load, plausible};
 use crate::fleet::traffic::{engaged_stops, routing};
 use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{RobotId, Subject};
@@ -194,10 +193,7 @@ pub fn task(
     {
         return Err(Reason::from(Code::RobotReconciling).with("robot_id", robot_id));
     }
-    if let Some(reason) = Wait::of_task(task, intake, &view.ended, now.utc).reason() {
-        return Err(reason);
-    }
-    place_breaker::first_broken(view, task, intake).map_or(Ok(()), Err)
+    view.wait_of(task, intake, now.utc).reason().map_or(Ok(()), Err)
 }
 
 /// An idle-looking errand that may be broken off for a task: parking, or charging above the area's threshold.

@@ -18,6 +18,7 @@ use crate::time::{Now, Utc};
 /// Brings the queue up to now: notes since when a task is ready, arms what counts from then, and gives to a person what can never be ready.
 pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
     advance(view, now.utc);
+    place_breaker::choose_probes(view, now.utc);
     coalesce(view, now, plan);
     for task_id in view.queue.failed.iter().take(TASKS_PER_TURN).cloned().collect::<Vec<_>>() {
         let why = view.queue.waiting.get(&task_id).and_then(|w| w.wait.reason());
@@ -26,9 +27,8 @@ pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut 
         }
         ask_person(view, now, &task_id, why.as_ref(), plan);
     }
-    let moved: Vec<TaskId> = view.queue.moved.iter().take(TASKS_PER_TURN).cloned().collect();
-    let mut began = Vec::new();
-    for task_id in moved {
+    let mut moved = Vec::new();
+    for task_id in view.queue.moved.iter().take(TASKS_PER_TURN).cloned().collect::<Vec<_>>() {
         if plan.is_cut() {
             return;
         }
@@ -42,18 +42,19 @@ pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut 
             timers::count_readiness(tx, &task_id);
         });
         view.queue.moved.remove(&task_id);
-        began.push(task_id);
+        moved.push(task_id);
     }
-    place_breaker::choose_tries(view, now.utc);
-    reckon_starts(view, now, &began);
+    reckon_starts(view, now, &moved);
     check_robots(view, now, plan);
 }
 
-/// Notes of some tasks that began to be ready, and of some that are for long, where they stand.
-fn reckon_starts(view: &mut FleetProjection, now: Now, began: &[TaskId]) {
-    for task_id in view.starts.pick_tasks(began.iter(), now.utc) {
-        let Some((position, rank)) = view.queue.position(&task_id).zip(view.queue.rank(&task_id)) else { continue };
-        view.starts.reckon_task(&task_id, position, rank.since, now.utc);
+/// Notes where some of the tasks stand that began to be ready, and some that are so for long.
+fn reckon_starts(view: &mut FleetProjection, now: Now, moved: &[TaskId]) {
+    for task_id in view.starts.pick_tasks(moved.iter(), now.utc) {
+        match view.queue.position(&task_id).zip(view.queue.rank(&task_id)) {
+            Some((position, rank)) => view.starts.reckon_task(&task_id, position, rank.since, now.utc),
+            None => view.starts.forget_task(&task_id),
+        }
     }
 }
 

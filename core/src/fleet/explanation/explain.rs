@@ -95,7 +95,9 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
     let eligible_ones = candidates.iter().filter(|c| c.reason.is_none()).count();
     let is_next = position.is_some_and(|position| position <= eligible_ones);
     let meant = wait_reasons::meant_for(view, now, task);
-    let start = view.queue.rank(task_id).zip(position);
+    // Who is busy comes back; of one that is kept from work nobody knows.
+    let is_awaited = |c: &RobotCandidate| c.reason.as_ref().is_none_or(|why| why.code == Code::RobotBusy);
+    let start = view.queue.rank(task_id).zip(position).filter(|_| candidates.iter().any(is_awaited));
     let start = start.and_then(|(rank, position)| view.starts.estimate(position, rank.since, now.utc));
     let expected = meant.map(|meant| meant.free.max(now.utc)).or_else(|| is_next.then_some(now.utc));
     let expected = expected.or_else(|| start.map(|start| start.p50));

@@ -9,6 +9,7 @@
 use crate::fleet::assignment::filters;
 use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::facts::stops::Hold;
+use crate::fleet::projection::broken_steps::StepAt;
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::memory::MeantFor;
 use crate::fleet::projection::queue::Wait;
@@ -73,21 +74,27 @@ fn queued(view: &FleetProjection, board: &Board, now: &Now, task: &TaskState, in
         let told = format!("robot {}: it is free soon and nearer than others", meant.robot_id);
         return Some(Reason::from(Code::WaitingForRobot).with(WAITS_FOR, told));
     };
-    if why.code == Code::PlaceBroken {
-        let told = |name| why.metadata.get(name).cloned().unwrap_or_default();
-        let close = format!("a person: midshift incident close {} --reason TEXT", told("incident_id"));
-        let waits_for = format!("a try from {} on, or {close}", told("again_time"));
-        return Some(why.with(WAITS_FOR, waits_for));
-    }
-    let what = match Wait::of_task(task, intake, &view.ended, now.utc) {
+    let what = match view.wait_of(task, intake, now.utc) {
         // What a person can end is told before what passes by itself.
         _ if task.held_by_person().is_some() => return held_by_person(task),
         Wait::Time(at) => at.rfc3339(),
         Wait::Hold(token) => return Some(held(why.code, &token)),
         Wait::Dependency(id) | Wait::Failed(id) => format!("task {id}"),
+        Wait::Step(at, _) => broken_step(view, now, &at),
         Wait::Turn(_) | Wait::Mark => task.robot_id.as_ref().map(|r| format!("robot {r}")).unwrap_or_default(),
     };
     Some(why.with(WAITS_FOR, what))
+}
+
+/// Who finds out whether a step that is broken can be done again.
+fn broken_step(view: &FleetProjection, now: &Now, at: &StepAt) -> String {
+    let Some(broken) = view.broken_steps.get(at) else { return String::new() };
+    let close = format!("a person: midshift incident close {} --reason TEXT", broken.incident_id);
+    match view.steps_failed.probe_of(at) {
+        Some(task_id) => format!("task {task_id}, which probes it, or {close}"),
+        None if broken.again > now.utc => format!("a probe at {}, or {close}", broken.again.rfc3339()),
+        None => format!("a task that probes it, or {close}"),
+    }
 }
 
 /// Who holds a task, and what lets it go on.

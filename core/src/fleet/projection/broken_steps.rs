@@ -1,5 +1,5 @@
-//! Steps that no robot is sent to do at one place, since several failed it there: derived from open incidents, with what only this process
-//! remembers of failures and tries.
+//! Actions that no robot is sent to do at one place, since several robots failed them there: derived from open incidents, with what only
+//! this process remembers of failures and probes.
 //!
 //! `tasks::place_breaker` opens and closes them; `index` keeps what is derived. Invariant: a step is broken exactly as long as its incident
 //! is open, so that every process and every start see the same.
@@ -8,6 +8,7 @@ use super::rows::Incident;
 use crate::ids::{RobotId, TaskId, WaypointId};
 use crate::reason::Code;
 use crate::step::{StepKind, WorkStep};
+use crate::task::{TaskIntake, TaskState};
 use crate::time::Utc;
 use smol_str::SmolStr;
 use std::collections::{BTreeMap, VecDeque};
@@ -15,50 +16,59 @@ use std::collections::{BTreeMap, VecDeque};
 /// Steps at places of which failures are remembered.
 const REMEMBERED_MAX: usize = 1_024;
 
-/// A step at the place where it is done.
+/// An action at the place where it is done.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct StepAt {
-    /// Where: the goal of the way before it.
+    /// The goal of the way before it.
     pub waypoint: WaypointId,
-    /// What: `goto`, or the name of the action.
-    pub step: SmolStr,
+    /// Name of the action.
+    pub action: SmolStr,
 }
 
 impl StepAt {
-    /// Steps that may be broken, each with its index. What is done before the first way is done nowhere in particular.
+    /// Actions of a task that may be broken, each with the index of its step. Left out is what is done before the first way, where nobody
+    /// knows the place, and what may fail without harm.
     pub fn of_steps(steps: &[WorkStep]) -> impl Iterator<Item = (u32, Self)> {
         let mut here: Option<&WaypointId> = None;
-        steps.iter().zip(0..).filter_map(move |(step, nth)| {
-            let name = match &step.kind {
-                StepKind::Goto { waypoint } => {
-                    here = Some(waypoint);
-                    "goto"
-                }
-                StepKind::Action { name, .. } => name,
-                StepKind::Wait { .. } => return None,
-            };
-            Some((nth, Self { waypoint: here?.clone(), step: name.into() }))
+        steps.iter().zip(0..).filter_map(move |(step, nth)| match &step.kind {
+            StepKind::Goto { waypoint } => {
+                here = Some(waypoint);
+                None
+            }
+            StepKind::Action { name, .. } if !step.continue_on_fail => {
+                Some((nth, Self { waypoint: here?.clone(), action: name.into() }))
+            }
+            StepKind::Action { .. } | StepKind::Wait { .. } => None,
         })
     }
 
-    /// Of an incident that says so.
+    /// The step that an incident says is broken.
     fn of_incident(incident: &Incident) -> Option<Self> {
-        let told = |name| incident.reason.metadata.get(name);
+        let told = |name| incident.reason.metadata.get(name).filter(|_| incident.reason.code == Code::PlaceBroken);
         let waypoint = WaypointId::parse(told("waypoint")?).ok()?;
-        Some(Self { waypoint, step: told("step")?.into() })
+        Some(Self { waypoint, action: told("action")?.into() })
     }
 }
 
-/// One of them.
+/// A step that is broken.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BrokenStep {
-    /// Its incident.
+    /// The incident that says so.
     pub incident_id: String,
-    /// UTC, site clock: from then on one task is given, as a try.
+    /// UTC, site clock: from then on one task is let through as a probe.
     pub again: Utc,
 }
 
-/// All of them, by what and where.
+/// What the change of an incident did to a step.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum StepChange {
+    /// It is broken now.
+    Broke(StepAt),
+    /// It is broken no more; with when a person, or the planner, closed its incident.
+    Mended(StepAt, Option<Utc>),
+}
+
+/// All steps that are broken.
 #[derive(Clone, Debug, Default)]
 pub struct BrokenSteps(BTreeMap<StepAt, BrokenStep>);
 
@@ -67,7 +77,7 @@ impl BrokenSteps {
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
-    /// The one of this step; none: it is not broken.
+    /// What is known of a step; none: it is not broken.
     pub fn get(&self, at: &StepAt) -> Option<&BrokenStep> {
         self.0.get(at)
     }
@@ -75,18 +85,25 @@ impl BrokenSteps {
     pub fn iter(&self) -> impl Iterator<Item = (&StepAt, &BrokenStep)> {
         self.0.iter()
     }
-    /// An incident changed: which step is broken no more.
-    pub(super) fn put_incident(&mut self, old: Option<&Incident>, new: Option<&Incident>) -> Option<StepAt> {
-        let broken = |incident: &&Incident| incident.reason.code == Code::PlaceBroken && incident.closed.is_none();
-        let (old, new) = (old.filter(broken), new.filter(broken));
-        let ended = old.and_then(StepAt::of_incident).filter(|_| new.is_none());
-        ended.iter().for_each(|at| drop(self.0.remove(at)));
-        if let Some((at, incident)) = new.and_then(|new| Some((StepAt::of_incident(new)?, new))) {
-            let told = incident.reason.metadata.get("again_time").and_then(|at| Utc::parse_rfc3339(at));
-            let again = told.unwrap_or(incident.opened_unix_ms);
-            self.0.insert(at, BrokenStep { incident_id: incident.id.clone(), again });
+    /// The first broken step of what is left of a task that is not the probe for it. What is opened goes on: its robot carries the item.
+    pub fn bars(&self, task: &TaskState, intake: &TaskIntake, memory: &StepMemory) -> Option<StepAt> {
+        if self.is_empty() || task.opened_robot_id.is_some() {
+            return None;
         }
-        ended
+        let mut left = StepAt::of_steps(&intake.spec.steps).filter(|(nth, _)| *nth >= task.next_step).map(|(_, at)| at);
+        left.find(|at| self.0.contains_key(at) && !memory.is_probe(at, &task.task_id))
+    }
+    /// An incident changed.
+    pub(super) fn put_incident(&mut self, old: Option<&Incident>, new: Option<&Incident>) -> Option<StepChange> {
+        let at = new.or(old).and_then(StepAt::of_incident)?;
+        let Some(incident) = new.filter(|incident| incident.closed.is_none()) else {
+            self.0.remove(&at);
+            return Some(StepChange::Mended(at, new.and_then(|new| Some(new.closed.as_ref()?.at))));
+        };
+        let told = incident.reason.metadata.get("again_time").and_then(|at| Utc::parse_rfc3339(at));
+        let again = told.unwrap_or(incident.opened_unix_ms);
+        let known = self.0.insert(at.clone(), BrokenStep { incident_id: incident.id.clone(), again });
+        known.is_none().then_some(StepChange::Broke(at))
     }
 }
 
@@ -97,12 +114,16 @@ pub struct StepMemory {
     failed: BTreeMap<StepAt, BTreeMap<RobotId, Utc>>,
     /// Steps in the order in which they were first remembered.
     order: VecDeque<StepAt>,
-    /// The task that is let through to try a broken step, and since when it may be given, UTC.
-    pub(in crate::fleet) tries: BTreeMap<StepAt, (TaskId, Utc)>,
+    /// The task that is let through to a broken step, and since when, UTC.
+    pub(in crate::fleet) probes: BTreeMap<StepAt, (TaskId, Utc)>,
 }
 
 impl StepMemory {
-    /// Notes a failure; all robots that failed the step within `window_ms`.
+    /// Whether nobody failed anything lately.
+    pub(in crate::fleet) fn is_empty(&self) -> bool {
+        self.failed.is_empty()
+    }
+    /// Notes a failure. Gives back all robots that failed the step within `window_ms`.
     pub(in crate::fleet) fn note_failure(
         &mut self,
         at: &StepAt,
@@ -117,17 +138,27 @@ impl StepMemory {
         failed.insert(robot_id.clone(), now);
         failed.retain(|_, failed| now.ms_since(*failed) <= window_ms);
         let robots = failed.keys().cloned().collect();
-        while self.order.len() > REMEMBERED_MAX {
-            let oldest = self.order.pop_front();
-            oldest.map(|at| self.failed.remove(&at));
+        if self.order.len() > REMEMBERED_MAX
+            && let Some(oldest) = self.order.front().cloned()
+        {
+            self.forget_failures(&oldest, now);
         }
         robots
     }
-    /// The step is as good as new.
-    pub(in crate::fleet) fn forget(&mut self, at: &StepAt) {
-        if self.failed.remove(at).is_some() {
+    /// Failures up to this moment count no more.
+    pub(in crate::fleet) fn forget_failures(&mut self, at: &StepAt, until: Utc) {
+        let Some(failed) = self.failed.get_mut(at) else { return };
+        failed.retain(|_, failed| *failed > until);
+        if failed.is_empty() {
+            self.failed.remove(at);
             self.order.retain(|known| known != at);
         }
-        self.tries.remove(at);
+    }
+    /// The task that is let through to a broken step.
+    pub fn probe_of(&self, at: &StepAt) -> Option<&TaskId> {
+        self.probes.get(at).map(|(task_id, _)| task_id)
+    }
+    fn is_probe(&self, at: &StepAt, task_id: &TaskId) -> bool {
+        self.probe_of(at) == Some(task_id)
     }
 }

@@ -1,8 +1,10 @@
 //! Keeps what is derived from rows: each row that changes brings the queue, deadlines, holders of places and robots to
 //! compose up to date.
 //!
-//! Invariant: what is derived depends on the rows alone, never on the order in which they came.
+//! Invariant: what is derived depends on the rows alone, never on the order in which they came; but for a probe of a broken step, which
+//! only the process knows that chose it.
 
+use super::broken_steps::{StepAt, StepChange};
 use super::queue::{Ended, TASKS_PER_TURN, Wait};
 use super::rows::{Drain, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotHolder};
 use super::state::FleetProjection;
@@ -69,9 +71,15 @@ impl Indexed<Incident> for FleetProjection {
     /// A person has looked: what was put aside is tried again.
     fn changed(view: &mut Self, id: &str, old: Option<&Incident>) {
         let new = view.incidents.get(id).map(|i| &i.row);
-        if let Some(at) = view.broken_steps.put_incident(old, new) {
-            view.steps_failed.forget(&at);
-            show_again(view);
+        match view.broken_steps.put_incident(old, new) {
+            Some(StepChange::Broke(at)) => bar_tasks(view, &at),
+            Some(StepChange::Mended(at, closed)) => {
+                closed.iter().for_each(|closed| view.steps_failed.forget_failures(&at, *closed));
+                view.steps_failed.probes.remove(&at);
+                let barred: Vec<TaskId> = view.queue.barred(&at).cloned().collect();
+                barred.iter().for_each(|task_id| put_in_queue(view, task_id));
+            }
+            None => {}
         }
         if let Some(closed) = view.incidents.get(id).map(|i| &i.row).filter(|i| i.closed.is_some()) {
             view.refused.incident_closed(&closed.reason);
@@ -193,16 +201,16 @@ fn move_deadline(view: &mut FleetProjection, task_id: &TaskId, old: Option<Utc>,
 /// Puts a task where its rows say that it stands: out of the queue, if it waits for no robot.
 pub(in crate::fleet) fn put_in_queue(view: &mut FleetProjection, task_id: &TaskId) {
     let rows = view.task(task_id).filter(|task| task.phase == Phase::Queued).zip(view.intake(task_id));
-    let mut is_ready = false;
+    let (mut is_ready, was_ready) = (false, view.queue.rank(task_id).is_some());
     let wait = rows.map(|(task, intake)| {
-        let wait = match Wait::of_task(task, intake, &view.ended, view.queue.now) {
+        let wait = match view.wait_of(task, intake, view.queue.now) {
             Wait::Turn(rank) if view.bugs.nobody_is_promoted() => Wait::Turn(rank.unpromoted(task.priority(intake))),
             wait => wait,
         };
-        is_ready = matches!(wait, Wait::Turn(_) | Wait::Mark);
+        is_ready = matches!(wait, Wait::Turn(_) | Wait::Step(..) | Wait::Mark);
         (wait, task.queued_since)
     });
-    if view.queue.rank(task_id).is_some() && !is_ready {
+    if was_ready && !is_ready {
         let is_given = view.task(task_id).is_some_and(|task| task.phase == Phase::Assigned);
         match is_given {
             true => view.starts.note_start(task_id, view.queue.now),
@@ -217,10 +225,14 @@ pub(in crate::fleet) fn put_in_queue(view: &mut FleetProjection, task_id: &TaskI
     }
 }
 
-/// What kept tasks from robots is over: robots that passed them over look again.
-fn show_again(view: &mut FleetProjection) {
-    let ready: Vec<TaskId> = view.queue.ready().cloned().collect();
-    ready.iter().for_each(|task_id| view.queue.show_again(task_id));
+/// A step is broken: whoever has it before him is ready no more.
+fn bar_tasks(view: &mut FleetProjection, at: &StepAt) {
+    let leads_there = |task_id: &&TaskId| {
+        let spec = view.intake(task_id).map(|intake| &intake.spec);
+        spec.is_some_and(|spec| spec.goals(0).any(|goal| *goal == at.waypoint))
+    };
+    let ready: Vec<TaskId> = view.queue.ready().filter(leads_there).cloned().collect();
+    ready.iter().for_each(|task_id| put_in_queue(view, task_id));
 }
 
 /// A task has ended: those that depend on it, if there are any, wait for the next thing, or for nothing more.
@@ -259,6 +271,17 @@ pub(in crate::fleet) fn advance(view: &mut FleetProjection, now: Utc) {
 }
 
 impl FleetProjection {
+    /// What a task that wants a robot waits for first.
+    pub fn wait_of(&self, task: &TaskState, intake: &TaskIntake, now: Utc) -> Wait {
+        match Wait::of_task(task, intake, &self.ended, now) {
+            Wait::Turn(rank) => match self.broken_steps.bars(task, intake, &self.steps_failed) {
+                Some(at) => Wait::Step(at, rank),
+                None => Wait::Turn(rank),
+            },
+            wait => wait,
+        }
+    }
+
     /// A task is over, or gone: nothing is asked any more of those that it waited for alone.
     pub(super) fn waits_no_more(&mut self, intake: &TaskIntake) {
         for task_id in intake.spec.waits_for() {

@@ -5,6 +5,7 @@
 //! 1. The order is total: two processes that have read the same rows serve the same task first.
 //! 2. A task that is not ready is looked at only when what it waits for may have come: its time, the end of a task, its last hold.
 
+use super::broken_steps::StepAt;
 use crate::ids::{RobotId, TaskId};
 use crate::limits;
 use crate::reason::{Code, Reason};
@@ -82,6 +83,8 @@ impl From<&TaskState> for Ended {
 pub enum Wait {
     /// Its turn.
     Turn(Rank),
+    /// A step that is broken at its place; with where it stands but for that.
+    Step(StepAt, Rank),
     /// Its turn, once it is written since when.
     Mark,
     /// Its time, UTC on the site clock.
@@ -129,6 +132,9 @@ impl Wait {
     pub fn reason(&self) -> Option<Reason> {
         Some(match self {
             Self::Turn(_) | Self::Mark => return None,
+            Self::Step(at, _) => {
+                Reason::from(Code::PlaceBroken).with("waypoint", &at.waypoint).with("action", &at.action)
+            }
             Self::Time(_) => Code::WaitingForTime.into(),
             Self::Hold(token) if token == OPERATOR_HOLD => Code::HoldByPerson.into(),
             Self::Hold(token) => Reason::from(Code::WaitingForHold).with("token", token),
@@ -160,7 +166,7 @@ impl Waiting {
         let due = match &wait {
             Wait::Time(at) => Some(*at),
             Wait::Turn(rank) => Some(after(rank.promoted_from)),
-            Wait::Mark | Wait::Hold(_) | Wait::Dependency(_) | Wait::Failed(_) => None,
+            Wait::Step(..) | Wait::Mark | Wait::Hold(_) | Wait::Dependency(_) | Wait::Failed(_) => None,
         };
         Self { wait, due, age, check: age.map(after) }
     }
@@ -179,6 +185,8 @@ pub struct Queue {
     pub(in crate::fleet) due: BTreeSet<(Utc, TaskId)>,
     /// Tasks by the one whose end they wait for.
     pub(in crate::fleet) dependents: BTreeMap<TaskId, BTreeSet<TaskId>>,
+    /// Tasks that would be ready, by the broken step that bars them.
+    barred: BTreeMap<StepAt, BTreeSet<Rank>>,
     /// Tasks by what they wait for.
     counts: BTreeMap<Code, usize>,
     /// Tasks that wait for what can never be.
@@ -249,6 +257,16 @@ impl Queue {
     fn milestones(&self) -> &Vec<Rank> {
         let every = || self.ready.iter().skip(MILESTONE - 1).step_by(MILESTONE).cloned().collect();
         self.milestones.get_or_init(every)
+    }
+    /// Of the tasks that a broken step bars the one behind `last` in the order of the queue, or the first.
+    pub(in crate::fleet) fn next_barred(&self, at: &StepAt, last: Option<&Rank>) -> Option<&TaskId> {
+        let barred = self.barred.get(at)?;
+        let behind = last.and_then(|last| barred.range((Bound::Excluded(last), Bound::Unbounded)).next());
+        behind.or_else(|| barred.first()).map(|rank| &rank.task_id)
+    }
+    /// Tasks that a broken step bars.
+    pub(in crate::fleet) fn barred(&self, at: &StepAt) -> impl Iterator<Item = &TaskId> {
+        self.barred.get(at).into_iter().flatten().map(|rank| &rank.task_id)
     }
     /// Tasks that wait, by what for.
     pub fn counts(&self) -> impl Iterator<Item = (Code, u64)> {
@@ -345,6 +363,7 @@ impl Queue {
                 self.ready.insert(rank.clone());
                 self.news.insert(rank.clone());
             }
+            Wait::Step(at, rank) => drop(self.barred.entry(at.clone()).or_default().insert(rank.clone())),
             Wait::Dependency(on) => drop(self.dependents.entry(on.clone()).or_default().insert(task_id.clone())),
             Wait::Failed(_) => drop(self.failed.insert(task_id.clone())),
             Wait::Mark | Wait::Time(_) | Wait::Hold(_) => {}
@@ -363,6 +382,14 @@ impl Queue {
                 self.milestones.take();
                 self.ready.remove(rank);
                 self.news.remove(rank);
+            }
+            Wait::Step(at, rank) => {
+                if let Some(barred) = self.barred.get_mut(at) {
+                    barred.remove(rank);
+                    if barred.is_empty() {
+                        self.barred.remove(at);
+                    }
+                }
             }
             Wait::Dependency(on) => {
                 if let Some(waiting) = self.dependents.get_mut(on) {

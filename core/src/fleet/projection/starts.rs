@@ -9,9 +9,9 @@ use crate::time::Utc;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// Tasks that are noted at once.
-const TICKETS_MAX: usize = 512;
+const NOTED_MAX: usize = 512;
 /// Tasks that are noted anew in one turn: looking for their places costs.
-const TICKETS_PER_TURN: usize = 8;
+const NOTED_PER_TURN: usize = 8;
 /// Starts that the pace is taken of.
 const STARTS_MAX: usize = 256;
 /// Older starts say nothing of the pace, milliseconds.
@@ -49,8 +49,8 @@ struct Reckoned {
 pub struct Starts {
     /// When tasks got a robot, the newest last.
     given: VecDeque<Utc>,
-    tickets: BTreeMap<TaskId, Vec<Reckoned>>,
-    /// When tasks with a ticket are reckoned again.
+    noted: BTreeMap<TaskId, Vec<Reckoned>>,
+    /// When tasks that are noted are reckoned again.
     due: BTreeSet<(Utc, TaskId)>,
     /// By how long tasks had waited then: how long they waited on, thousandths of what was reckoned.
     ratios: Vec<VecDeque<u64>>,
@@ -63,7 +63,7 @@ impl Starts {
         if self.given.len() > STARTS_MAX {
             self.given.pop_front();
         }
-        for Reckoned { at, age, usual_ms } in self.tickets.remove(task_id).into_iter().flatten() {
+        for Reckoned { at, age, usual_ms } in self.noted.remove(task_id).into_iter().flatten() {
             if self.ratios.len() <= age {
                 self.ratios.resize(age + 1, VecDeque::new());
             }
@@ -77,7 +77,7 @@ impl Starts {
 
     /// A task waits for a robot no more, and got none.
     pub(in crate::fleet) fn forget_task(&mut self, task_id: &TaskId) {
-        self.tickets.remove(task_id);
+        self.noted.remove(task_id);
     }
 
     /// Tasks to reckon in this turn: some of those that are `new`, and those that have waited for long.
@@ -86,14 +86,14 @@ impl Starts {
         new: impl ExactSizeIterator<Item = &'t TaskId>,
         now: Utc,
     ) -> Vec<TaskId> {
-        let room = TICKETS_MAX.saturating_sub(self.tickets.len()).min(TICKETS_PER_TURN);
+        let room = NOTED_MAX.saturating_sub(self.noted.len()).min(NOTED_PER_TURN);
         let every = new.len().div_ceil(room.max(1)).max(1);
         let mut picked: Vec<TaskId> = new.step_by(every).take(room).cloned().collect();
         while let Some((at, task_id)) =
-            self.due.first().filter(|(at, _)| *at <= now && picked.len() < 2 * TICKETS_PER_TURN).cloned()
+            self.due.first().filter(|(at, _)| *at <= now && picked.len() < 2 * NOTED_PER_TURN).cloned()
         {
             self.due.remove(&(at, task_id.clone()));
-            picked.extend(self.tickets.contains_key(&task_id).then_some(task_id));
+            picked.extend(self.noted.contains_key(&task_id).then_some(task_id));
         }
         picked
     }
@@ -102,9 +102,9 @@ impl Starts {
     pub(in crate::fleet) fn reckon_task(&mut self, task_id: &TaskId, position: usize, since: Utc, now: Utc) {
         let Some(usual_ms) = self.usual_ms(position, now) else { return };
         let age = age_of(now.ms_since(since));
-        let ticket = self.tickets.entry(task_id.clone()).or_default();
-        if ticket.last().is_none_or(|last| last.age < age) {
-            ticket.push(Reckoned { at: now, age, usual_ms });
+        let noted = self.noted.entry(task_id.clone()).or_default();
+        if noted.last().is_none_or(|last| last.age < age) {
+            noted.push(Reckoned { at: now, age, usual_ms });
         }
         self.due.insert((since.plus_ms(AGAIN_MS * ((2 << age) - 1)), task_id.clone()));
     }
@@ -195,8 +195,6 @@ mod tests {
         let mut starts = Starts::default();
         let many: Vec<TaskId> = (10_000..20_000).map(task).collect();
         let picked = starts.pick_tasks(many.iter(), Utc(0));
-        assert!(
-            picked.len() <= TICKETS_PER_TURN && picked[0] == many[0] && *picked.last().expect("some") > many[8_000]
-        );
+        assert!(picked.len() <= NOTED_PER_TURN && picked[0] == many[0] && *picked.last().expect("some") > many[8_000]);
     }
 }

@@ -2,6 +2,7 @@
 
 mod arrivals;
 mod backlog;
+mod broken_steps;
 mod changes;
 mod closed_places;
 mod drains;

@@ -46,9 +46,9 @@ async fn what_three_robots_failed_at_a_place_waits_ten_minutes_for_one_try_and_g
     let seen = w.until_phase("back", Phase::Succeeded).await;
     assert_eq!((seen.phase("T4"), seen.phase("T5")), (Phase::Queued, Phase::Queued), "another step at A is no matter");
     let told = verdict(&w, "T4").await;
-    assert_eq!((told.code.as_str(), told.metadata["step"].as_str()), ("PLACE_BROKEN", "pick"));
+    assert_eq!((told.code.as_str(), told.metadata["action"].as_str()), ("PLACE_BROKEN", "pick"));
     assert!(told.metadata[WAITS_FOR].contains("midshift incident close PLACE_BROKEN:A:pick"), "{told:?}");
-    let seen = w.until("one tries", |s| s.phase("T4") != Phase::Queued).await;
+    let seen = w.until("one is let through", |s| s.phase("T4") != Phase::Queued).await;
     assert!(seen.task("T4").changed >= incident.opened_unix_ms.plus_ms(600_000) && seen.phase("T5") == Phase::Queued);
     let seen = w.until("it is picked", |s| broken(s).is_none()).await;
     assert_eq!(seen.phase("T4"), Phase::Running);
@@ -57,30 +57,31 @@ async fn what_three_robots_failed_at_a_place_waits_ten_minutes_for_one_try_and_g
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_try_that_fails_keeps_the_others_back_for_ten_minutes_more() {
+async fn a_probe_that_fails_keeps_the_others_back_for_ten_minutes_more_and_the_incident_stays_as_old_as_it_is() {
     let mut w = three_failed().await;
+    let opened = broken(&w.seen().await).expect("an incident");
     for id in ["T4", "T5"] {
         w.submit(id, "A", "B").await;
     }
-    let seen = w.until("one tries", |s| s.phase("T4") != Phase::Queued).await;
+    let seen = w.until("one is let through", |s| s.phase("T4") != Phase::Queued).await;
     let robot_id = seen.robot_of("T4").expect("a robot");
     w.r(&robot_id).fails = Some((1, jam()));
     let seen = w.until_phase("T4", Phase::NeedsOperator).await;
-    let (again, failed) = (broken(&seen).expect("still broken"), seen.task("T4").changed);
-    assert_eq!(again.reason.metadata["again_time"], failed.plus_ms(600_000).rfc3339());
-    let seen = w.until("the next one tries", |s| s.phase("T5") != Phase::Queued).await;
+    let (still, failed) = (broken(&seen).expect("still broken"), seen.task("T4").changed);
+    assert_eq!(still.reason.metadata["again_time"], failed.plus_ms(600_000).rfc3339());
+    assert_eq!(
+        (still.opened_unix_ms, &still.reason.metadata["robots"]),
+        (opened.opened_unix_ms, &"r1, r2, r3".to_owned())
+    );
+    let seen = w.until("the next one is", |s| s.phase("T5") != Phase::Queued).await;
     assert!(seen.task("T5").changed >= failed.plus_ms(600_000));
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_person_who_has_looked_lets_tasks_go_there_at_once_and_three_more_failures_close_it_again() {
+async fn a_person_who_has_looked_lets_tasks_go_there_at_once_and_what_failed_before_counts_no_more() {
     let mut w = three_failed().await;
     w.submit("T4", "A", "B").await;
     w.pass_while(5, "it waits", |s| s.phase("T4") == Phase::Queued).await;
-    // Whoever plans now has not seen the failures.
-    w.stop_fleet().await;
-    w.start_fleet();
-    w.pass_while(5, "it waits still", |s| s.phase("T4") == Phase::Queued).await;
     let incident_id = broken(&w.seen().await).expect("an incident").id;
     let close = v1::CloseIncidentRequest { incident_id, reason: "filled".to_owned(), ..Default::default() };
     w.fleet.close_incident(local(close)).await.expect("closed");
@@ -90,4 +91,30 @@ async fn a_person_who_has_looked_lets_tasks_go_there_at_once_and_three_more_fail
     let seen = w.until_phase("T4", Phase::NeedsOperator).await;
     assert_eq!(broken(&seen), None, "one more is not three");
     w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn who_plans_next_has_not_seen_the_failures_and_sends_nobody_there_either() {
+    let mut w = three_failed().await;
+    w.submit("T4", "A", "B").await;
+    w.stop_fleet().await;
+    w.start_fleet();
+    w.pass_while(500, "it waits still", |s| s.phase("T4") == Phase::Queued).await;
+    w.until_phase("T4", Phase::Succeeded).await;
+    assert_eq!(broken(&w.seen().await), None);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_robot_that_did_it_between_two_that_failed_it_begins_the_count_anew() {
+    let mut w = World::on(CORRIDOR).await;
+    for (n, at, fault) in [(1, "park-a", true), (2, "park-b", true), (3, "B", false), (4, "charge", true)] {
+        let (task_id, robot_id) = (format!("T{n}"), format!("r{n}"));
+        w.robot(&robot_id, at).await;
+        w.r(&robot_id).fails = fault.then(|| (1, jam()));
+        w.submit_with(&task_id, "A", "B", |raw| raw.robot_id = robot_id).await;
+        let ends = if fault { Phase::NeedsOperator } else { Phase::Succeeded };
+        w.until_phase(&task_id, ends).await;
+    }
+    assert_eq!(broken(&w.seen().await), None);
 }

@@ -76,7 +76,7 @@ async fn rules_of_the_planner_are_put_whole_and_only_over_those_that_were_seen()
     assert_eq!(rules(&w.fleet).await, changed);
     let horizon = Some(duration(1_000));
     let whole = put(&w.fleet, v1::PlannerPolicy { horizon, ..Default::default() }).await.expect("whatever it is");
-    assert_eq!((whole.horizon, whole.ageing_permille), (horizon, Some(100)), "what is absent takes its default");
+    assert_eq!((whole.horizon, whole.ageing_permille), (horizon, Some(200)), "what is absent takes its default");
     let mut request = v1::PutPlannerRequest { policy: Some(changed), validate_only: true, ..Default::default() };
     let stale = w.fleet.put_planner(local(request.clone())).await.expect_err("moved");
     assert_eq!(stale.code(), Code::Aborted);
