@@ -1,8 +1,8 @@
 //! Tasks that a broken step bars: who waits, who does not, and who is let through as a probe.
 
 use super::*;
-use crate::fleet::{WAITS_FOR, explain};
 use crate::fleet::projection::rows::{Incident, IncidentClosure};
+use crate::fleet::{WAITS_FOR, explain};
 use crate::reason::Code;
 use crate::task::raw::RawStepKind;
 
