@@ -2,7 +2,8 @@
 //!
 //! An answer comes some minutes after a task began to wait, and says what is true of the item:
 //! 1. It was put down where it was to go: done by hand.
-//! 2. A robot carries it: the task goes on there, once the server lets the robot go on.
+//! 2. A robot carries it: the task goes on there, once the server lets the robot go on. As long as the service does not show that the robot
+//!    has begun with it, the robot was not heard since, and nothing is said: another robot would fetch a second item.
 //! 3. Nobody carries it: it lies where it was picked, and the task begins anew.
 //!
 //! Invariant: the person knows the floor and what the service shows, and no row.
@@ -94,6 +95,7 @@ impl Operator {
     fn choose_resolution(&self, task_id: &TaskId, task: &Task) -> Option<Resolution> {
         let found = match (self.is_delivered(task_id, task), self.is_carried(task_id)) {
             (true, _) => Resolution::Succeeded,
+            (false, true) if task.opened_robot_id.is_empty() => return None,
             (false, true) => Resolution::Requeue,
             (false, false) if task.opened_robot_id.is_empty() => Resolution::Requeue,
             (false, false) => Resolution::RequeuePutBack,
