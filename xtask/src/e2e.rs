@@ -319,7 +319,8 @@ fn command(workspace: &Workspace, program: &Path) -> Command {
 
 /// Builds the test program; where it is.
 fn program(workspace: &Workspace) -> Result<PathBuf> {
-    let how = ["test", "--workspace", "--test", NAME, "--no-run", "--message-format", "json-render-diagnostics"];
+    // With all tests, as they were built: of one alone the crates below have other features, and are compiled once more.
+    let how = ["test", "--workspace", "--tests", "--no-run", "--message-format", "json-render-diagnostics"];
     let output = workspace.cargo(&how).stderr(std::process::Stdio::inherit()).output().context("running cargo")?;
     ensure!(output.status.success(), "the end-to-end tests do not build");
     let lines = String::from_utf8_lossy(&output.stdout).into_owned();
