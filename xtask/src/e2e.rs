@@ -24,7 +24,7 @@ use std::time::Duration;
 
 /// The test program.
 pub const NAME: &str = "e2e";
-/// Modules (`name::`) and single tests that take more than one permit of five that two busy cores have.
+/// Modules (`name::`) and single tests that take more than one permit of two a busy core.
 const HEAVY: &[(&str, usize)] = &[
     ("followed::", 2),
     ("handed_over::", 2),
@@ -32,6 +32,7 @@ const HEAVY: &[(&str, usize)] = &[
     ("kill::nothing_is_lost_and_nothing_done_twice_on_postgresql_", 2),
     ("languages::each_client_and_foreign_ones_", 3),
     ("languages::each_client_gives_up_in_time_and_outlives_a_split_stack_", 2),
+    ("largest::as_many_batches_at_once_", 2),
     ("night::", 2),
     ("old_site::", 2),
     ("partition::", 2),
@@ -149,7 +150,7 @@ struct Permits {
 
 impl Permits {
     fn new() -> Self {
-        Self { busy: threads() * 5 / 4, idle: 3 * threads() }
+        Self { busy: threads(), idle: 3 * threads() }
     }
 
     /// The first in the queue, if it has its permits beside those that are used.
