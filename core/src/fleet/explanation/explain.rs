@@ -7,7 +7,7 @@ use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::facts::misreads;
 use crate::fleet::projection::chosen::PlanChoice;
 use crate::fleet::projection::liveness::Board;
-use crate::fleet::projection::starts::StartEstimate;
+use crate::fleet::projection::start_estimates::StartEstimate;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::load;
 use crate::fleet::traffic::{closed_places, routing};

@@ -210,7 +210,7 @@ pub(in crate::fleet) fn put_in_queue(view: &mut FleetProjection, task_id: &TaskI
         is_ready = matches!(wait, Wait::Turn(_) | Wait::Step(..) | Wait::Mark);
         (wait, task.queued_since)
     });
-    if was_ready && !is_ready {
+    if was_ready && !matches!(wait, Some((Wait::Turn(_), _))) {
         let is_given = view.task(task_id).is_some_and(|task| task.phase == Phase::Assigned);
         match is_given {
             true => view.starts.note_start(task_id, view.queue.now),
@@ -225,7 +225,7 @@ pub(in crate::fleet) fn put_in_queue(view: &mut FleetProjection, task_id: &TaskI
     }
 }
 
-/// A step is broken: whoever has it before him is ready no more.
+/// A step is broken: a task that has it still before it is ready no more.
 fn bar_tasks(view: &mut FleetProjection, at: &StepAt) {
     let leads_there = |task_id: &&TaskId| {
         let spec = view.intake(task_id).map(|intake| &intake.spec);

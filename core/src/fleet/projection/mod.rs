@@ -1,7 +1,7 @@
 //! Fleet's projection: its rows by table, indices derived from them, and memory of this process alone.
 //!
 //! In reading order: `rows` and `command` define the rows that only fleet writes. `queue`, `ready`, `same_key`, `memory`, `chosen`,
-//! `starts`, `broken_steps` and `refused` are parts of the projection, and `state` is the whole. `index` updates the indices; `loading` reads rows in. `liveness`
+//! `start_estimates`, `broken_steps` and `refused` are parts of the projection, and `state` is the whole. `index` updates the indices; `loading` reads rows in. `liveness`
 //! answers whether a robot is heard, `objects` whether a caller may act on something.
 //! Invariant: nothing here decides: this module makes no item and uses no sibling module.
 
@@ -18,7 +18,7 @@ pub mod ready;
 pub mod refused;
 pub mod rows;
 pub mod same_key;
-pub mod starts;
+pub mod start_estimates;
 pub mod state;
 
 pub use crate::projection::{RevisedRow, RowMap};

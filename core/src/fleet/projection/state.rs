@@ -13,7 +13,7 @@ use super::rows::{
     RobotCounter, RobotHolder, ServiceClock, SiteRow, Timer,
 };
 use super::same_key::SameKey;
-use super::starts::Starts;
+use super::start_estimates::Starts;
 use crate::desired_state::{DesiredPolicy, DesiredWork};
 use crate::drain_request::{DrainRelease, DrainRequest};
 use crate::fleet::bugs::Bugs;

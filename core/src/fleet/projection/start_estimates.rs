@@ -100,7 +100,7 @@ impl Starts {
 
     /// Notes where a ready task stands that is ready since then.
     pub(in crate::fleet) fn reckon_task(&mut self, task_id: &TaskId, position: usize, since: Utc, now: Utc) {
-        let Some(usual_ms) = self.usual_ms(position, now) else { return };
+        let Some(usual_ms) = self.usual_ms(position, now) else { return self.forget_task(task_id) };
         let age = age_of(now.ms_since(since));
         let noted = self.noted.entry(task_id.clone()).or_default();
         if noted.last().is_none_or(|last| last.age < age) {
