@@ -1,10 +1,15 @@
 //! `midshift zone …`: passages and standing places.
 
+use super::area::milliseconds;
 use super::client::{Call, Change, Exit, unary};
+use super::duration::duration;
 use super::out::{Format, Out};
 use super::pages::{self, Listed, PAGE_SIZE};
 use clap::Subcommand;
+use midshift_proto::convert::time_of;
 use midshift_proto::fleet::v1;
+use prost_types::Timestamp;
+use std::time::Duration;
 
 /// Verbs of places.
 #[derive(Subcommand)]
@@ -13,7 +18,7 @@ pub enum Verb {
     Ls {
         #[command(flatten)]
         call: Call,
-        /// Only places that are held, waited for or quarantined.
+        /// Only places that are held, waited for, quarantined or blocked.
         #[arg(long)]
         in_use: bool,
     },
@@ -32,6 +37,33 @@ pub enum Verb {
         #[command(flatten)]
         change: Change,
     },
+    /// Let nobody into a place; robots that were let in before still drive through.
+    Block {
+        #[command(flatten)]
+        call: Call,
+        /// The place into which nobody is let.
+        place_id: String,
+        /// Why.
+        #[arg(long)]
+        reason: String,
+        /// Site time until that ends by itself; without it a person ends it.
+        #[arg(long = "for", value_name = "DURATION", value_parser = duration)]
+        lasts: Option<Duration>,
+        #[command(flatten)]
+        change: Change,
+    },
+    /// Let robots into a place again.
+    Unblock {
+        #[command(flatten)]
+        call: Call,
+        /// The place that is open again.
+        place_id: String,
+        /// Why.
+        #[arg(long)]
+        reason: String,
+        #[command(flatten)]
+        change: Change,
+    },
 }
 
 /// Runs one verb.
@@ -46,11 +78,39 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
                 reason,
                 validate_only: change.dry_run,
             };
-            let place = call.fleet().await?.clear_place(unary(request)).await?.into_inner().place.unwrap_or_default();
-            out.one(&place, &place.place_id, || place.row().join("  "))?;
+            let answer = call.fleet().await?.clear_place(unary(request)).await?.into_inner();
+            show(answer.place, out).map(drop)
+        }
+        Verb::Block { call, place_id, reason, lasts, change } => {
+            let request = v1::BlockPlaceRequest {
+                place_id,
+                request_id: change.request_id,
+                reason,
+                lasts: lasts.map(milliseconds),
+                validate_only: change.dry_run,
+            };
+            let answer = call.fleet().await?.block_place(unary(request)).await?.into_inner();
+            let place = show(answer.place, out)?;
+            out.next(&format!("midshift zone unblock {} --reason TEXT", place.place_id));
             Ok(())
         }
+        Verb::Unblock { call, place_id, reason, change } => {
+            let request = v1::UnblockPlaceRequest {
+                place_id,
+                request_id: change.request_id,
+                reason,
+                validate_only: change.dry_run,
+            };
+            let answer = call.fleet().await?.unblock_place(unary(request)).await?.into_inner();
+            show(answer.place, out).map(drop)
+        }
     }
+}
+
+fn show(place: Option<v1::Place>, out: &Out) -> Result<v1::Place, Exit> {
+    let place = place.unwrap_or_default();
+    out.one(&place, &place.place_id, || place.row().join("  "))?;
+    Ok(place)
 }
 
 async fn list(call: &Call, in_use: bool) -> Result<v1::ListPlacesResponse, Exit> {
@@ -79,8 +139,7 @@ fn describe_kept_place(place: &v1::Place, robot_id: &str) -> String {
 }
 
 impl Listed for v1::Place {
-    const HEADER: &'static [&'static str] =
-        &["PLACE", "KIND", "RULE", "SEATS", "HELD BY", "WAITING", "QUARANTINE", "ETAG"];
+    const HEADER: &'static [&'static str] = &["PLACE", "KIND", "RULE", "SEATS", "HELD BY", "WAITING", "CLOSED", "ETAG"];
     fn name(&self) -> String {
         self.place_id.clone()
     }
@@ -97,10 +156,18 @@ impl Listed for v1::Place {
             self.capacity.to_string(),
             self.holders.iter().map(holder).chain(awaited).collect::<Vec<_>>().join(", "),
             self.waiting_robot_ids.join(", "),
-            self.quarantine.as_ref().map(|q| q.code.clone()).unwrap_or_default(),
+            describe_closure(self),
             self.etag.clone(),
         ]
     }
+}
+
+/// What keeps robots out of a place, in a word or two. Empty: nothing.
+fn describe_closure(place: &v1::Place) -> String {
+    let until = |until: &Timestamp| format!(" until {}", time_of(until).rfc3339());
+    let block = |block: &v1::PlaceBlock| format!("blocked{}", block.until.as_ref().map_or_else(String::new, until));
+    let words = place.quarantine.iter().map(|reason| reason.code.clone()).chain(place.block.iter().map(block));
+    words.collect::<Vec<_>>().join(", ")
 }
 
 #[cfg(test)]

@@ -176,6 +176,7 @@ retention_rules! {
     Place::Table(Table::Timer) => [Operations] Operate Standing;
     Place::Table(Table::HoldToken) => [Operations] Operate Standing;
     Place::Table(Table::PlaceGrant) => [Operations, Position] Operate Newest;
+    Place::Table(Table::PlaceBlock) => [Operations, Person] Operate Standing;
     Place::Table(Table::RobotAuthority) => [Operations] Operate Newest;
     Place::Table(Table::RobotControl) => [Operations, Person] Operate Standing;
     Place::Table(Table::RobotCounter) => [Machine, Software] Diagnose Month;

@@ -68,6 +68,7 @@ tables! {
     Timer "timer" Fleet, "A deadline in serving time. id = kind and attempt.";
     HoldToken "hold_token" Fleet, "A reason why a task or robot must not move. id = scope, owner and token.";
     PlaceGrant "place_grant" Fleet, "One passage or standing place: holders, queue, quarantine. id = place_id.";
+    PlaceBlock "place_block" Fleet, "A person's word that nobody is let into a place. id = place_id.";
     RobotAuthority "robot_authority" Fleet, "The robot's mutex: none, a task's attempt, an errand, maintenance. id = robot_id.";
     RobotControl "robot_control" Fleet, "Cordon, breaker, counters of failures, errand number. id = robot_id.";
     RobotCounter "robot_counter" Fleet, "Work done per robot and software version. id = robot_id@software.";

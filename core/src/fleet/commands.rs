@@ -1,5 +1,5 @@
-//! What people ask of fleet directly: cordon, uncordon and retire, a word about a load, rules of an area and of the planner, clearing a
-//! place, closing an incident. Each is one item, answered after its commit.
+//! What people ask of fleet directly: cordon, uncordon and retire, a word about a load, rules of an area and of the planner, clearing
+//! and blocking a place, closing an incident. Each is one item, answered after its commit.
 
 use crate::audit::Note;
 use crate::fleet::decision::incidents;
@@ -7,7 +7,7 @@ use crate::fleet::decision::plan::Tx;
 use crate::fleet::maintenance::drain;
 pub use crate::fleet::projection::command::Command;
 use crate::fleet::projection::liveness::{self, Board};
-use crate::fleet::projection::rows::{Cordon, HolderState, Place, PlaceHolder, RobotControl};
+use crate::fleet::projection::rows::{Cordon, HolderState, Place, PlaceBlock, PlaceHolder, RobotControl};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::{arrivals, claims, load};
 use crate::identity::Caller;
@@ -81,6 +81,17 @@ pub fn check(
             };
             may_clear(board, now, &row.row)?;
             row.revision
+        }
+        Command::BlockPlace { place_id, .. } | Command::UnblockPlace { place_id, .. } => {
+            if !view.places.contains_key(place_id.as_str()) {
+                return Err(Refusal::new(Kind::NotFound, Reason::from(Code::PlaceNotFound).with("place_id", place_id)));
+            }
+            let block = view.place_blocks.get(place_id.as_str());
+            if block.is_none() && matches!(command, Command::UnblockPlace { .. }) {
+                let reason = Reason::from(Code::PlaceNotBlocked).with("place_id", place_id);
+                return Err(Refusal::new(Kind::Precondition, reason));
+            }
+            block.map_or(Revision(0), |block| block.revision)
         }
         Command::CloseIncident { incident_id, .. } => {
             let found = view.incidents.get(incident_id.as_str()).filter(|i| i.row.closed.is_none());
@@ -230,6 +241,13 @@ pub fn note(view: &FleetProjection, command: &Command) -> Note {
             let robots = view.places.get(place_id.as_str()).into_iter().flat_map(|place| &place.row.holders);
             robots.fold(note, |note, holder| note.about("robot", &holder.robot_id))
         }
+        Command::BlockPlace { place_id, reason, lasts_ms } => {
+            let note = Note::new("place.block").about("place", place_id).because(reason);
+            lasts_ms.iter().fold(note, |note, lasts_ms| note.with("lasts_ms", lasts_ms))
+        }
+        Command::UnblockPlace { place_id, reason } => {
+            Note::new("place.unblock").about("place", place_id).because(reason)
+        }
         Command::CloseIncident { incident_id, reason } => {
             let note = Note::new("incident.close").about("incident", incident_id).because(reason);
             let Some(incident) = view.incidents.get(incident_id.as_str()).map(|i| &i.row) else { return note };
@@ -311,6 +329,17 @@ pub fn apply(tx: &mut Tx, board: &Board, command: &Command, actor: &str) {
             let Some(place) = tx.view.places.get(place_id.as_str()).map(|p| p.row.clone()) else { return };
             clear(tx, board, place);
         }
+        Command::BlockPlace { place_id, reason, lasts_ms } => {
+            let block = PlaceBlock {
+                place_id: place_id.clone(),
+                reason: reason.clone(),
+                actor: actor.to_owned(),
+                since: tx.now.utc,
+                until: lasts_ms.map(|ms| tx.now.utc.plus_ms(ms)),
+            };
+            tx.put_row(block, "place.blocked");
+        }
+        Command::UnblockPlace { place_id, .. } => tx.delete::<PlaceBlock>(place_id.as_str(), "place.unblocked"),
         Command::CloseIncident { incident_id, reason } => incidents::close(tx, incident_id, reason, actor),
     }
 }

@@ -56,7 +56,7 @@ use maintenance::{budget, drain};
 use projection::rows::{Place, RobotAuthority, RobotControl, RobotHolder, ServiceClock, SiteRow};
 use projection::state::FleetProjection;
 use tasks::arrivals;
-use traffic::{allocation, closed_places, desired};
+use traffic::{allocation, blocked_places, closed_places, desired};
 
 /// Says whether other processes may contend for the lease of fleet's planner.
 pub fn contenders(is_shared: bool, bugs: bugs::Bugs) -> Contenders {
@@ -136,6 +136,9 @@ pub fn cycle(view: &mut FleetProjection, now: Now, board: &Board, pace: Pace, pl
     plan.slice.renew();
     if pace == Pace::Sweep || view.stops_changed {
         stops::plan(view, board, now, plan);
+    }
+    if pace == Pace::Sweep {
+        blocked_places::end_blocks(view, now, plan);
     }
     plan.slice.renew();
     drain::obey_requests(view, now, plan);

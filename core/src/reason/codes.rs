@@ -59,6 +59,7 @@ codes! {
     NotStuck = "NOT_STUCK", "The robot is not stuck on its way back from a bundle." => "`midshift robot explain ROBOT` says what it waits for.";
     ResolutionNotAllowed = "RESOLUTION_NOT_ALLOWED", "This resolution is not among the task's allowed resolutions."
         => "`midshift task get TASK` lists those.";
+    PlaceNotBlocked = "PLACE_NOT_BLOCKED", "Nobody blocked this place." => "`midshift zone ls` shows which are blocked.";
     PlaceNotClear = "PLACE_NOT_CLEAR", "A robot reports that it stands in this place." => "Move it out first.";
     CursorExpired = "CURSOR_EXPIRED", "The cursor is older than what is kept." => "Start again without one.";
     CursorOfOtherStore = "CURSOR_OF_OTHER_STORE", "The cursor comes from another store." => "Start again without one.";
@@ -372,6 +373,8 @@ codes! {
         => "Look at it, then `midshift robot uncordon ROBOT`.";
     PlaceBroken = "PLACE_BROKEN", "Three robots failed this action at this place within ten minutes, so no more are sent there for it. After ten minutes one task is let through as a probe, and its success closes the incident."
         => "Look there, put it right, then `midshift incident close INCIDENT --reason TEXT`.";
+    PlaceBlocked = "PLACE_BLOCKED", "A person blocked this place: nobody is let in until the block ends."
+        => "Wait for its end, or `midshift zone unblock PLACE --reason TEXT`.";
     PlaceQuarantined = "PLACE_QUARANTINED", "A place, or a seat of it, is kept closed until the robot that may be inside reports or a person clears it."
         => "Look there, then `midshift zone clear PLACE --reason TEXT --if-match ETAG`; `midshift zone ls` shows the ETAG.";
     HoldByPerson = "HOLD_BY_PERSON", "A person holds the task." => "`midshift task release TASK --reason TEXT` lets it go on.";

@@ -148,6 +148,12 @@ pub fn place(view: &FleetProjection, row: &Place, revision: Revision) -> v1::Pla
         etag: etag(revision),
         area_id: area.unwrap_or_default(),
         awaited_robot_ids: awaited,
+        block: view.place_blocks.get(row.place_id.as_str()).map(|block| v1::PlaceBlock {
+            reason: block.row.reason.clone(),
+            since: Some(timestamp(block.row.since)),
+            until: block.row.until.map(timestamp),
+            actor: block.row.actor.clone(),
+        }),
     }
 }
 

@@ -1,5 +1,6 @@
 //! The gRPC face of fleet: decode, call, encode.
 
+use crate::arguments::{check_reason, internal, place_and_request, request_id, robot_and_request};
 use crate::{FleetService, encode};
 use midshift_core::fleet::commands::Command;
 use midshift_core::fleet::objects::{sees_incident, sees_place, sees_robot, sees_task};
@@ -7,7 +8,6 @@ use midshift_core::fleet::rows::Incident;
 use midshift_core::fleet::{explain, projection::FleetProjection};
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::ids::{AreaId, AttemptId, PlaceId, RobotId, Subject, TaskId};
-use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violations};
 use midshift_core::rows::{Key, Revision, Table};
 use midshift_core::task::{TaskIntake, TaskState};
@@ -27,19 +27,8 @@ use tonic::{Request, Response, Status};
 const DRAIN_WITHIN_MS: i64 = 30 * 60_000;
 /// What a caller may say.
 const DRAIN_MS: std::ops::RangeInclusive<i64> = 1_000..=24 * 3_600_000;
-
-fn request_id(text: &str, bad: &mut Violations) -> Option<String> {
-    if !text.is_empty() {
-        bad.accept("request_id", midshift_core::ids::RequestId::parse(text));
-    }
-    (!text.is_empty()).then(|| text.to_owned())
-}
-
-fn reason_text(text: &str, bad: &mut Violations) {
-    if text.is_empty() || text.len() > limits::REASON_BYTES_MAX {
-        bad.add("reason", "is required, 1-256 bytes");
-    }
-}
+/// Site time after which the block of a place may end by itself.
+const BLOCK_MS: std::ops::RangeInclusive<i64> = 1_000..=30 * 24 * 3_600_000;
 
 fn not_found(code: Code, id: impl std::fmt::Display) -> Refusal {
     Refusal::new(Kind::NotFound, Reason::from(code).with("id", id))
@@ -47,23 +36,6 @@ fn not_found(code: Code, id: impl std::fmt::Display) -> Refusal {
 
 fn answer<T>(result: Result<T, Refusal>) -> Result<Response<T>, Status> {
     result.map(Response::new).map_err(|refusal| midshift_proto::status(&refusal, None))
-}
-
-/// The robot and the request_id of a command about one robot, or everything that is wrong with the request.
-/// `reason`: none where the command asks for none.
-fn robot_and_request(
-    robot_id: &str,
-    request: &str,
-    reason: Option<&str>,
-    mut bad: Violations,
-) -> Result<(RobotId, Option<String>), Refusal> {
-    let robot_id = bad.accept("robot_id", RobotId::parse(robot_id));
-    let request_id = request_id(request, &mut bad);
-    if let Some(reason) = reason {
-        reason_text(reason, &mut bad);
-    }
-    bad.finish()?;
-    Ok((robot_id.ok_or_else(internal)?, request_id))
 }
 
 impl FleetService {
@@ -257,6 +229,7 @@ impl FleetService {
                 let in_use = |p: &midshift_core::fleet::rows::Place| {
                     !p.holders.is_empty()
                         || p.quarantine.is_some()
+                        || view.place_blocks.contains_key(p.place_id.as_str())
                         || view.waits.values().any(|w| w.places.contains(&p.place_id))
                 };
                 let rows = view.places.iter().filter(|(_, p)| !r.in_use || in_use(&p.row));
@@ -269,23 +242,42 @@ impl FleetService {
 
     async fn clear(&self, r: v1::ClearPlaceRequest, by: &Caller) -> Result<v1::ClearPlaceResponse, Refusal> {
         let mut bad = Violations::default();
-        let place_id = bad.accept("place_id", PlaceId::parse(&r.place_id));
-        let request_id = request_id(&r.request_id, &mut bad);
-        reason_text(&r.reason, &mut bad);
         let seen: Option<Revision> = revision_of(&r.etag);
         if seen.is_none() {
             bad.add("etag", "is required: a person clears what the person saw");
         }
-        bad.finish()?;
-        let place_id = place_id.ok_or_else(internal)?;
+        let (place_id, request_id) = place_and_request(&r.place_id, &r.request_id, &r.reason, bad)?;
         let command = Command::ClearPlace { place_id: place_id.clone(), reason: r.reason };
         self.act(command, by, seen, r.validate_only, request_id).await?;
-        let place = self
-            .query_projection(move |view, _, _| {
-                view.places.get(place_id.as_str()).map(|p| encode::place(view, &p.row, p.revision))
-            })
-            .await?;
-        Ok(v1::ClearPlaceResponse { place })
+        Ok(v1::ClearPlaceResponse { place: self.place(place_id).await? })
+    }
+
+    async fn block(&self, r: v1::BlockPlaceRequest, by: &Caller) -> Result<v1::BlockPlaceResponse, Refusal> {
+        let mut bad = Violations::default();
+        let lasts_ms = parse_ms(r.lasts.as_ref(), At::top("lasts"), &mut bad);
+        if lasts_ms.is_some_and(|ms| !BLOCK_MS.contains(&ms)) {
+            bad.add("lasts", "must be 1 s to 30 days");
+        }
+        let (place_id, request_id) = place_and_request(&r.place_id, &r.request_id, &r.reason, bad)?;
+        let lasts_ms = lasts_ms.map(i64::unsigned_abs);
+        let command = Command::BlockPlace { place_id: place_id.clone(), reason: r.reason, lasts_ms };
+        self.act(command, by, None, r.validate_only, request_id).await?;
+        Ok(v1::BlockPlaceResponse { place: self.place(place_id).await? })
+    }
+
+    async fn unblock(&self, r: v1::UnblockPlaceRequest, by: &Caller) -> Result<v1::UnblockPlaceResponse, Refusal> {
+        let bad = Violations::default();
+        let (place_id, request_id) = place_and_request(&r.place_id, &r.request_id, &r.reason, bad)?;
+        let command = Command::UnblockPlace { place_id: place_id.clone(), reason: r.reason };
+        self.act(command, by, None, r.validate_only, request_id).await?;
+        Ok(v1::UnblockPlaceResponse { place: self.place(place_id).await? })
+    }
+
+    async fn place(&self, place_id: PlaceId) -> Result<Option<v1::Place>, Refusal> {
+        self.query_projection(move |view, _, _| {
+            view.places.get(place_id.as_str()).map(|p| encode::place(view, &p.row, p.revision))
+        })
+        .await
     }
 
     async fn why_task(&self, r: v1::ExplainTaskRequest, by: &Caller) -> Result<v1::ExplainTaskResponse, Refusal> {
@@ -393,7 +385,7 @@ impl FleetService {
     async fn close_one(&self, r: v1::CloseIncidentRequest, by: &Caller) -> Result<v1::CloseIncidentResponse, Refusal> {
         let mut bad = Violations::default();
         let request_id = request_id(&r.request_id, &mut bad);
-        reason_text(&r.reason, &mut bad);
+        check_reason(&r.reason, &mut bad);
         bad.finish()?;
         let command = Command::CloseIncident { incident_id: r.incident_id.clone(), reason: r.reason };
         self.act(command, by, revision_of(&r.etag), r.validate_only, request_id).await?;
@@ -418,11 +410,6 @@ impl FleetService {
             .await?;
         Ok(v1::ListCountersResponse { counters, next_page_token })
     }
-}
-
-/// An id that could not be read without a violation: cannot happen.
-fn internal() -> Refusal {
-    Refusal::new(Kind::Internal, Code::Internal)
 }
 
 #[tonic::async_trait]
@@ -525,6 +512,17 @@ impl Face for FleetService {
     async fn clear_place(&self, r: Request<v1::ClearPlaceRequest>) -> Result<Response<v1::ClearPlaceResponse>, Status> {
         let by = caller(&r);
         answer(self.clear(r.into_inner(), &by).await)
+    }
+    async fn block_place(&self, r: Request<v1::BlockPlaceRequest>) -> Result<Response<v1::BlockPlaceResponse>, Status> {
+        let by = caller(&r);
+        answer(self.block(r.into_inner(), &by).await)
+    }
+    async fn unblock_place(
+        &self,
+        r: Request<v1::UnblockPlaceRequest>,
+    ) -> Result<Response<v1::UnblockPlaceResponse>, Status> {
+        let by = caller(&r);
+        answer(self.unblock(r.into_inner(), &by).await)
     }
     async fn explain_task(
         &self,

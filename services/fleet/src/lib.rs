@@ -3,6 +3,7 @@
 //! Called by the server: [`FleetService::new`], its gRPC face, and [`Reconciler::run`]. Invariant: nothing is decided here; a lost wake
 //! costs one sweep; no promise is kept in memory.
 
+mod arguments;
 mod commit;
 mod encode;
 mod figures;

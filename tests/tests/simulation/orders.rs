@@ -3,9 +3,11 @@
 //! Invariant: asked twice it does the same once; "not now" is an answer like any other.
 
 use crate::net;
+use midshift_proto::convert::duration;
 use midshift_proto::fleet::v1::fleet_service_client::FleetServiceClient;
 use midshift_proto::fleet::v1::{
-    ClearPlaceRequest, DrainRobotRequest, ListPlacesRequest, RetireRobotRequest, UncordonRobotRequest,
+    BlockPlaceRequest, ClearPlaceRequest, DrainRobotRequest, ListPlacesRequest, RetireRobotRequest,
+    UncordonRobotRequest,
 };
 use midshift_proto::ota::v1 as ota;
 use midshift_proto::ota::v1::rollout_service_client::RolloutServiceClient;
@@ -68,6 +70,13 @@ pub enum Order {
     Retire(String),
     /// A person has looked: nobody is in this place.
     Clear(String),
+    /// A person lets nobody into this place for a while.
+    Block {
+        /// The place.
+        place_id: String,
+        /// Milliseconds until that ends by itself.
+        lasts_ms: u64,
+    },
     /// What a person does about a roll-out that waits for one: goes on with one that stands still, ends one that must be judged.
     Settle(String),
 }
@@ -176,6 +185,11 @@ async fn ask(order: &Order) -> Result<(), Status> {
             let reason = "it behaves badly".to_owned();
             let request = RetireRobotRequest { robot_id, reason, ..RetireRobotRequest::default() };
             FleetServiceClient::new(channel).retire_robot(request).await.map(drop)
+        }
+        Order::Block { place_id, lasts_ms } => {
+            let (reason, lasts) = ("a spill".to_owned(), Some(duration(lasts_ms)));
+            let request = BlockPlaceRequest { place_id, reason, lasts, ..BlockPlaceRequest::default() };
+            FleetServiceClient::new(channel).block_place(request).await.map(drop)
         }
         Order::Clear(place_id) => clear(FleetServiceClient::new(channel), place_id).await,
         Order::Settle(id) => settle(&mut client, id).await,

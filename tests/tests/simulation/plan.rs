@@ -15,6 +15,8 @@ use std::collections::BTreeSet;
 pub const ROBOTS: usize = 10;
 /// Tasks of a run.
 pub const TASKS: usize = 24;
+/// Places that people block, of those of the demo site.
+const PLACES: [&str; 6] = ["door", "aisle", "crossing", "A01", "B02", "C01"];
 /// Faults begin after this and none begins later than the end, milliseconds.
 const FAULTS_MS: std::ops::Range<u64> = 8_000..100_000;
 
@@ -114,6 +116,8 @@ pub enum Deed {
     Pin(usize),
     /// Let it take part again.
     Unpin(usize),
+    /// Let nobody into a place for so many milliseconds.
+    Block(&'static str, u64),
 }
 
 /// A whole run.
@@ -152,7 +156,9 @@ impl Plan {
         let cancels = cancels.collect();
         let latency_ms = rng.random_range(5..60);
         // From a stream of its own: faults and tasks of a seed stay what they were.
-        let deeds = deeds(&mut StdRng::seed_from_u64(seed ^ 0x0072_656c_6561_7365));
+        let mut deeds = deeds(&mut StdRng::seed_from_u64(seed ^ 0x0072_656c_6561_7365));
+        deeds.extend(blocks(&mut StdRng::seed_from_u64(seed ^ 0x0062_6c6f_636b)));
+        deeds.sort_by_key(|(at, _)| *at);
         Ok(Self { cancels, windows, skews, tasks, deeds, latency_ms })
     }
     /// No fault lasts and nothing is asked for after this, milliseconds.
@@ -229,6 +235,16 @@ fn deeds(rng: &mut StdRng) -> Vec<(u64, Deed)> {
     }
     deeds.sort_by_key(|(at, _)| *at);
     deeds
+}
+
+/// Places that people block for a while, some of them twice.
+fn blocks(rng: &mut StdRng) -> Vec<(u64, Deed)> {
+    let blocks = rng.random_range(0..=3);
+    let block = |_| {
+        let place = PLACES[rng.random_range(0..PLACES.len())];
+        (rng.random_range(4_000..90_000), Deed::Block(place, rng.random_range(5_000..40_000)))
+    };
+    (0..blocks).map(block).collect()
 }
 
 /// Somebody, another for each roll-out.

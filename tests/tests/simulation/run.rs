@@ -329,6 +329,7 @@ impl Shift {
                 Deed::Exclude(number, robot) => Order::Exclude(id(number), name(robot)),
                 Deed::Pin(robot) => Order::Pin(name(robot)),
                 Deed::Unpin(robot) => Order::Unpin(name(robot)),
+                Deed::Block(place_id, lasts_ms) => Order::Block { place_id: place_id.to_owned(), lasts_ms },
             };
             self.order(order);
         }

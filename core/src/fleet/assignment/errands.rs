@@ -139,7 +139,8 @@ fn free(
         let Some(row) = view.places.get(place.place_id.as_str()).map(|p| &p.row) else { return false };
         let coming = coming.0.get(view.site.name_of(*at)).copied().unwrap_or_default();
         row.holder(robot_id).is_some()
-            || (row.quarantine.is_none() && starts::taken(view, ix, row, robot_id) + coming < row.capacity as usize)
+            || (!routing::closed(view).contains(ix)
+                && starts::taken(view, ix, row, robot_id) + coming < row.capacity as usize)
     });
     view.router.nearest(here, open).map(|(at, _)| at)
 }

@@ -16,7 +16,7 @@ use crate::fleet::projection::queue::Wait;
 use crate::fleet::projection::rows::{Place, RobotHolder};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::{claims, eligibility, plausible};
-use crate::fleet::traffic::{closed_places, engaged_stops, grants, route_requests, starts};
+use crate::fleet::traffic::{blocked_places, closed_places, engaged_stops, grants, route_requests, starts};
 use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{PlaceId, RobotId};
 use crate::presence::Presence;
@@ -28,6 +28,8 @@ use std::collections::BTreeSet;
 
 /// The fact that names places which are closed.
 const SHUT: &str = "quarantined";
+/// The fact that names places which people blocked.
+const BLOCKED: &str = "blocked";
 
 /// Whether a reason says what is done, or names what it waits for.
 pub fn is_told(reason: &Reason) -> bool {
@@ -306,7 +308,7 @@ pub fn of_robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &Rob
     }
 }
 
-/// Which places the robot waits for, and what is in the way: a place that is closed, holders of one without a free seat, robots that start
+/// Which places the robot waits for, and what is in the way: a place that is closed or blocked, holders of one without a free seat, robots that start
 /// there, a stop, whoever came first, an area that is full, or a free seat that others go to first. None: it waits for none.
 pub fn place_wait(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> {
     let wait = view.waits.get(robot_id)?;
@@ -323,6 +325,9 @@ pub fn place_wait(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> 
             if key == SHUT {
                 let closure = names.iter().find_map(|id| closed_places::find_closed(view, &view.places.get(*id)?.row));
                 reason = closure.into_iter().fold(reason, |reason, closure| closure.word_reason(reason));
+            } else if key == BLOCKED {
+                let block = wait.places.iter().find_map(|id| view.place_blocks.get(id.as_str()));
+                reason = block.into_iter().fold(reason, |reason, block| blocked_places::word_block(reason, &block.row));
             }
         }
         reason = reason.with(key, names.join(" "));
@@ -336,7 +341,7 @@ fn in_the_way(
     view: &FleetProjection,
     robot_id: &RobotId,
     places: &[PlaceId],
-) -> [(&'static str, &'static str, BTreeSet<String>); 7] {
+) -> [(&'static str, &'static str, BTreeSet<String>); 8] {
     let rows = || places.iter().filter_map(|id| view.places.get(id.as_str())).map(|p| &p.row);
     let known = || places.iter().filter_map(|id| view.site.find_place(id));
     let others = |id: &&RobotId| *id != robot_id;
@@ -361,6 +366,11 @@ fn in_the_way(
             SHUT,
             "waits for a place that is closed until a person clears it",
             rows().filter(is_shut).map(|p| p.place_id.to_string()).collect(),
+        ),
+        (
+            BLOCKED,
+            "waits for a place that a person blocked",
+            places.iter().filter(|id| view.place_blocks.contains_key(id.as_str())).map(ToString::to_string).collect(),
         ),
         ("held_by", "waits for a place that another robot holds", holders(false)),
         (

@@ -81,6 +81,22 @@ pub enum Command {
         /// What the person saw.
         reason: String,
     },
+    /// Nobody is let into a place for a while.
+    BlockPlace {
+        /// The place into which nobody is let.
+        place_id: PlaceId,
+        /// Why, in a person's words.
+        reason: String,
+        /// Milliseconds of site time until that ends by itself; none: a person ends it.
+        lasts_ms: Option<u64>,
+    },
+    /// Ends the block of a place.
+    UnblockPlace {
+        /// The place that is open again.
+        place_id: PlaceId,
+        /// Why, in a person's words.
+        reason: String,
+    },
     /// A person has looked into it.
     CloseIncident {
         /// The incident that is closed.

@@ -6,7 +6,7 @@
 
 use super::broken_steps::{StepAt, StepChange};
 use super::queue::{Ended, TASKS_PER_TURN, Wait};
-use super::rows::{Drain, HoldToken, Incident, Place, RobotAuthority, RobotControl, RobotHolder};
+use super::rows::{Drain, HoldToken, Incident, Place, PlaceBlock, RobotAuthority, RobotControl, RobotHolder};
 use super::state::FleetProjection;
 use crate::ids::{RobotId, TaskId};
 use crate::policy::AreaPolicy;
@@ -156,6 +156,12 @@ impl Indexed<RobotControl> for FleetProjection {
 impl Indexed<Session> for FleetProjection {
     fn changed(view: &mut Self, id: &str, _old: Option<&Session>) {
         view.dirty.extend(view.sessions.get(id).map(|s| s.row.robot_id.clone()));
+    }
+}
+
+impl Indexed<PlaceBlock> for FleetProjection {
+    fn changed(view: &mut Self, _id: &str, _old: Option<&PlaceBlock>) {
+        view.closed_places.take();
     }
 }
 

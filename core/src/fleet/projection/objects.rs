@@ -92,7 +92,9 @@ pub fn permit(view: &FleetProjection, board: &Board, by: &Caller, command: &Comm
         }
         // The site's: a right that was given for areas is not enough.
         Command::PutPlanner(_) => by.authorize(operate, []),
-        Command::ClearPlace { place_id, .. } => {
+        Command::ClearPlace { place_id, .. }
+        | Command::BlockPlace { place_id, .. }
+        | Command::UnblockPlace { place_id, .. } => {
             if !view.places.contains_key(place_id.as_str()) {
                 return Ok(());
             }

@@ -330,6 +330,29 @@ impl Record for HoldToken {
     }
 }
 
+/// A person's word that nobody is let into a place for a while. Robots that were let in before still drive through.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PlaceBlock {
+    /// The place into which nobody is let.
+    pub place_id: PlaceId,
+    /// Why, in a person's words.
+    pub reason: String,
+    /// Who said so.
+    pub actor: String,
+    /// Since when, UTC, site clock.
+    pub since: Utc,
+    /// When it ends by itself, UTC, site clock; none: a person ends it.
+    pub until: Option<Utc>,
+}
+
+impl Record for PlaceBlock {
+    const TABLE: Table = Table::PlaceBlock;
+    body_is_json!();
+    fn id(&self) -> String {
+        self.place_id.to_string()
+    }
+}
+
 /// Work done by one robot on one version of its software.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RobotCounter {

@@ -9,8 +9,8 @@ use super::queue::{Ended, Queue};
 use super::ready::ReadyTasks;
 use super::refused::Refused;
 use super::rows::{
-    AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, PlaceHolder, RobotAuthority, RobotControl,
-    RobotCounter, RobotHolder, ServiceClock, SiteRow, Timer,
+    AreaBudget, CommandKey, Drain, FleetMark, HoldToken, Incident, Place, PlaceBlock, PlaceHolder, RobotAuthority,
+    RobotControl, RobotCounter, RobotHolder, ServiceClock, SiteRow, Timer,
 };
 use super::same_key::SameKey;
 use super::start_estimates::Starts;
@@ -46,6 +46,8 @@ projection! {
         holds: HoldToken = HoldToken Indexed;
         /// Passages and standing places.
         places: Place = PlaceGrant Indexed;
+        /// Places into which nobody is let, as people say.
+        place_blocks: PlaceBlock = PlaceBlock Indexed;
         /// Robots' mutexes.
         authority: RobotAuthority = RobotAuthority Indexed;
         /// Cordons and breakers.

@@ -5,7 +5,7 @@
 
 use super::desired::{Release, Releases};
 use super::grants::{self, Occupancy};
-use super::{bays, route_requests};
+use super::{bays, rerouting, route_requests};
 use crate::fleet::decision::plan::{Plan, Tx};
 use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::memory::Waiting;
@@ -56,6 +56,10 @@ fn allocate(tx: &mut Tx, live: &NewestHeartbeat, releases: &mut Releases, occupa
         if let Some(released_index) = released {
             releases.0.insert(robot_id.clone(), Release { route: None, released_index });
         }
+        return;
+    }
+    if is_whole && rerouting::reroute(tx, live, &a, &work, releases) {
+        tx.view.waits.remove(robot_id);
         return;
     }
     let names = needed.iter().map(|p| tx.view.site.place(*p).place_id.clone()).collect();

@@ -6,7 +6,7 @@
 //! 2. A closed place has one open incident, which closes by itself once the place is open.
 //! 3. An incident that a person closes while the place stays closed is told again after [`limits::LASTS_BEFORE_INCIDENT`].
 
-use super::engaged_stops;
+use super::{blocked_places, engaged_stops};
 use crate::fleet::decision::incidents;
 use crate::fleet::decision::plan::Plan;
 use crate::fleet::decision::report::WAITS_FOR;
@@ -102,22 +102,25 @@ impl ClosedPlace {
     }
 }
 
-/// A way that a closed place bars, with that place; another reason stays as it is.
+/// A way that a closed or blocked place bars, with that place; another reason stays as it is.
 pub fn name_closed(view: &FleetProjection, reason: Reason) -> Reason {
     if reason.code != Code::PlaceOccupied || !reason.message.is_empty() {
         return reason;
     }
     let goal = reason.metadata.get("goal").and_then(|goal| WaypointId::parse(goal).ok());
     let goal = goal.and_then(|goal| view.site.find(&goal)).and_then(|at| view.site.standing_at(at));
+    let goal_block = goal.and_then(|ix| blocked_places::find_block(view, ix));
     let goal = goal.and_then(|ix| view.places.get(view.site.place(ix).place_id.as_str()));
     let is_shut = |place: &&Place| place.quarantine.is_some();
     let goal = goal.map(|place| &place.row).filter(is_shut);
     // A stop may bar the way as well: then nobody says which of them does.
     let is_alone = || engaged_stops::closed(view).is_empty();
     let on_the_way = || view.places.values().map(|place| &place.row).find(is_shut).filter(|_| is_alone());
+    let block =
+        || goal_block.or_else(|| view.place_blocks.values().next().map(|block| &block.row).filter(|_| is_alone()));
     match goal.or_else(on_the_way).and_then(|place| find_closed(view, place)) {
         Some(closure) => closure.word_reason(reason),
-        None => reason,
+        None => block().map_or(reason.clone(), |block| blocked_places::word_block(reason, block)),
     }
 }
 

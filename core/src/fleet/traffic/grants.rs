@@ -3,9 +3,9 @@
 //! Invariant: a place has no more holders than seats, and an area admits one robot less than it has. Grants are traffic, never a safety function.
 
 use super::anchor::next_generation;
-use super::{engaged_stops, starts};
+use super::{blocked_places, starts};
 use crate::fleet::decision::plan::Tx;
-use crate::fleet::projection::rows::{HolderState, PlaceHolder};
+use crate::fleet::projection::rows::{HolderState, PlaceBlock, PlaceHolder};
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{AreaId, PlaceId, RobotId};
 use crate::limits;
@@ -18,7 +18,7 @@ const GRANTS_PER_GENERATION: u64 = 1024;
 /// What one round of grants knows beside the rows.
 #[derive(Default)]
 pub(super) struct Occupancy {
-    /// Places that an earlier request waits for.
+    /// Places that an earlier request waits for, and those that nobody is let into.
     blocked: BTreeSet<PlaceIx>,
     /// Robots that hold a standing place of an area, or start in one.
     inside: BTreeMap<AreaIx, BTreeSet<RobotId>>,
@@ -26,7 +26,7 @@ pub(super) struct Occupancy {
 
 impl Occupancy {
     pub fn from_projection(view: &FleetProjection) -> Self {
-        let mut occupancy = Self { blocked: engaged_stops::closed(view), ..Self::default() };
+        let mut occupancy = Self { blocked: blocked_places::barred(view), ..Self::default() };
         let standing = view.site.places().iter().filter(|p| p.waypoint().is_some());
         for place in standing {
             let Some(row) = view.places.get(place.place_id.as_str()).map(|p| &p.row) else { continue };
@@ -117,6 +117,8 @@ pub(super) fn grant_places(tx: &mut Tx, robot_id: &RobotId, needed: &[PlaceIx], 
         let id = tx.view.site.place(*ix).place_id.clone();
         let Some(mut place) = tx.view.places.get(id.as_str()).map(|p| p.row.clone()) else { continue };
         if place.holder(robot_id).is_none() {
+            // A person may have blocked it by another process a moment ago.
+            tx.rely::<PlaceBlock>(id.as_str());
             place.holders.push(PlaceHolder {
                 robot_id: robot_id.clone(),
                 grant_id,

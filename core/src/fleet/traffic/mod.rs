@@ -1,18 +1,21 @@
 //! Grants places to robots, routes them, and composes what each robot should do.
 //!
-//! In reading order: `engaged_stops` and `starts` find places that a fleet stop or an expected robot keeps. `routing`
-//! finds a route. `anchor` ties a permission to a heartbeat. `desired` composes desired work. `route_requests` orders
-//! the robots that need more of their route. `grants` checks that places are free and grants them. `bays` clears a
-//! place that others need. `allocation` runs all of it in turn. `closed_places` tells people what is closed.
+//! In reading order: `engaged_stops`, `blocked_places` and `starts` find places that a fleet stop, a person or an expected
+//! robot keeps. `routing` finds a route. `anchor` ties a permission to a heartbeat. `desired` composes desired work.
+//! `route_requests` orders the robots that need more of their route. `grants` checks that places are free and grants them.
+//! `rerouting` leads around closed places, `bays` clears a place that others need. `allocation` runs all of it in turn.
+//! `closed_places` tells people what is closed.
 //! Invariant: a place passes to another robot only by a robot's own report or by a person, never by time.
 
 pub mod allocation;
 pub mod anchor;
 mod bays;
+pub mod blocked_places;
 pub mod closed_places;
 pub mod desired;
 pub mod engaged_stops;
 pub mod grants;
+mod rerouting;
 pub mod route_requests;
 pub mod routing;
 pub mod starts;

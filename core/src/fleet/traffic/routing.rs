@@ -1,6 +1,6 @@
 //! Routes as robots get them: from where a robot stands through every goal that is left, around places that are closed.
 
-use super::engaged_stops;
+use super::blocked_places;
 use crate::desired_state::RoutePoint;
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::WaypointId;
@@ -9,12 +9,12 @@ use crate::site::route::Blocked;
 use crate::site::{Site, WaypointIx};
 use crate::step::{StepKind, WorkStep};
 
-/// Places that no route may lead into now: found once, until a place or a stop changes.
+/// Places that no route may lead into now: found once, until a place, a block or a stop changes.
 pub fn closed(view: &FleetProjection) -> &Blocked {
     view.closed_places.get_or_init(|| {
         let quarantined = view.places.values().filter(|p| p.row.quarantine.is_some());
         let quarantined = quarantined.filter_map(|p| view.site.find_place(&p.row.place_id));
-        Blocked::new(quarantined.chain(engaged_stops::closed(view)))
+        Blocked::new(quarantined.chain(blocked_places::barred(view)))
     })
 }
 

@@ -4,6 +4,7 @@
 mod harness;
 
 mod arrivals;
+mod blocks;
 mod claims;
 mod drains;
 mod ended;

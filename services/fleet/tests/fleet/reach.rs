@@ -167,6 +167,15 @@ async fn lists_have_what_lies_where_the_caller_sees() {
     {
         assert_eq!(code(w.fleet.clear_place(asked(&anna, clear(place))).await), expected, "{place}");
     }
+    let block = |place_id: &str| {
+        let (place_id, reason) = (place_id.to_owned(), "a spill".to_owned());
+        v1::BlockPlaceRequest { place_id, reason, ..Default::default() }
+    };
+    for (place, expected) in
+        [("Q01", Code::PermissionDenied), ("P01", Code::NotFound), ("door", Code::PermissionDenied), ("A01", Code::Ok)]
+    {
+        assert_eq!(code(w.fleet.block_place(asked(&anna, block(place))).await), expected, "{place}");
+    }
     let own = w.fleet.clear_place(asked(&anna, clear("A01"))).await;
     assert!(!matches!(code(own), Code::PermissionDenied | Code::NotFound), "it is hers");
 }

@@ -562,6 +562,9 @@ impl Robot {
         }
         self.at = next;
         self.progress += 1;
+        if let Some(listed) = self.attempts.iter_mut().find(|a| a.attempt == job.attempt) {
+            listed.route_index = next as u32;
+        }
     }
 
     fn move_to(&mut self, point: &RoutePoint, needed: &[PlaceId]) {
