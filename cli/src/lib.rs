@@ -136,7 +136,7 @@ async fn dispatch(command: Command, out: &Out) -> Result<(), Exit> {
         Command::Incident(verb) => incident::run(verb, out).await,
         Command::Area(verb) => area::run(verb, out).await,
         Command::Planner(verb) => planner::run(verb, out).await,
-        Command::Map(verb) => map::run(verb, out),
+        Command::Map(verb) => map::run(verb, out).await,
         Command::Bundle(verb) => bundle::run(verb, out).await,
         Command::Rollout(verb) => rollout::run(*verb, out).await,
         Command::Quarantine(verb) => quarantine::run(verb, out).await,

@@ -1,10 +1,15 @@
-//! `midshift map …`: site files. Needs no server.
+//! `midshift map …`: site files. Only `map show --robots` needs a server.
 
-use super::client::Exit;
+use super::client::{Call, Exit};
 use super::out::{Format, Out};
+use super::{robot, zone};
 use crate::site_file;
 use clap::Subcommand;
-use midshift_core::site::{grid, lif, lint, show, text};
+use midshift_core::ids::WaypointId;
+use midshift_core::site::show::{Occupants, PlacedRobot};
+use midshift_core::site::{Site, grid, lif, lint, show, text};
+use midshift_proto::telemetry::v1;
+use serde_json::json;
 use std::path::{Path, PathBuf};
 
 /// Verbs of maps.
@@ -22,34 +27,68 @@ pub enum Verb {
     Show {
         /// The site file; without it the demo.
         file: Option<PathBuf>,
+        /// Draw the robots of a server where they are, and who has which place.
+        #[arg(long)]
+        robots: bool,
+        #[command(flatten)]
+        call: Call,
     },
 }
 
 /// Runs one verb.
-pub fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
+pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
-        Verb::Show { file } => {
+        Verb::Show { file, robots, call } => {
             let site = site_file::load(file.as_deref(), None, None)?.site;
+            let occupants = if robots { Some(find_occupants(&call, &site).await?) } else { None };
             match out.format {
-                Format::Json | Format::Jsonl => {
-                    let places: Vec<_> = site.places().iter().map(|p| serde_json::json!({"placeId": p.place_id, "kind": p.kind_str(), "rule": p.rule_str(), "capacity": p.capacity})).collect();
-                    let waypoints: Vec<_> = site
-                        .waypoints()
-                        .iter()
-                        .map(|w| serde_json::json!({"waypointId": w.waypoint_id, "xMm": w.x_mm, "yMm": w.y_mm, "kind": w.kind.as_str()}))
-                        .collect();
-                    out.line(
-                        &serde_json::json!({"siteId": site.site_id(), "waypoints": waypoints, "places": places})
-                            .to_string(),
-                    );
-                }
+                Format::Json | Format::Jsonl => out.line(&document(&site, occupants.as_ref()).to_string()),
                 Format::Name => site.waypoints().iter().for_each(|w| out.line(w.waypoint_id.as_str())),
-                Format::Table => out.line(show::show(&site).trim_end()),
+                Format::Table => out.line(show::show(&site, occupants.as_ref()).trim_end()),
             }
             Ok(())
         }
         Verb::Lint { file, robots } => check(file.as_deref(), robots, out),
     }
+}
+
+fn document(site: &Site, occupants: Option<&Occupants>) -> serde_json::Value {
+    let place = |p: &midshift_core::site::Place| json!({"placeId": p.place_id, "kind": p.kind_str(), "rule": p.rule_str(), "capacity": p.capacity});
+    let waypoint = |w: &midshift_core::site::Waypoint| json!({"waypointId": w.waypoint_id, "xMm": w.x_mm, "yMm": w.y_mm, "kind": w.kind.as_str()});
+    let mut whole = json!({
+        "siteId": site.site_id(),
+        "waypoints": site.waypoints().iter().map(waypoint).collect::<Vec<_>>(),
+        "places": site.places().iter().map(place).collect::<Vec<_>>(),
+    });
+    if let Some(occupants) = occupants {
+        let robot = |r: &PlacedRobot| json!({"robotId": r.robot_id, "xMm": r.x_mm, "yMm": r.y_mm, "does": r.does});
+        whole["robots"] = occupants.robots.iter().map(robot).collect();
+        whole["held"] = json!(occupants.held);
+    }
+    whole
+}
+
+/// Robots that said where they are, and who has which place, as the server knows them.
+async fn find_occupants(call: &Call, site: &Site) -> Result<Occupants, Exit> {
+    let robots = robot::robots(call).await?.iter().filter_map(|robot| place_robot(site, robot)).collect();
+    let places = zone::list(call, true).await?.places;
+    let held = places.iter().map(|place| (place.place_id.clone(), zone::describe_holders(place))).collect();
+    Ok(Occupants { robots, held })
+}
+
+/// Where a robot is by its pose, or by the waypoint that it passed last. None: it said neither, or the site has no such waypoint.
+fn place_robot(site: &Site, robot: &v1::Robot) -> Option<PlacedRobot> {
+    let reported = robot.reported.as_ref()?;
+    let vitals = reported.vitals.as_ref()?;
+    let at = || WaypointId::parse(&vitals.waypoint).ok().and_then(|name| site.find(&name)).map(|at| site.waypoint(at));
+    let (x_mm, y_mm) = match &vitals.pose {
+        Some(pose) => (pose.x_mm.into(), pose.y_mm.into()),
+        None => at().map(|at| (at.x_mm, at.y_mm))?,
+    };
+    let presence = robot.presence().as_str_name().trim_start_matches("PRESENCE_").to_lowercase();
+    let works_on = reported.attempts.iter().filter_map(|listed| listed.attempt.as_ref());
+    let words = std::iter::once(presence).chain(works_on.map(|attempt| attempt.subject.clone()));
+    Some(PlacedRobot { robot_id: robot.robot_id.clone(), x_mm, y_mm, does: words.collect::<Vec<_>>().join(", ") })
 }
 
 fn check(file: Option<&Path>, robots: Option<u64>, out: &Out) -> Result<(), Exit> {

@@ -4,7 +4,7 @@ mod adopt;
 mod software;
 mod table;
 
-pub use table::controls;
+pub use table::{controls, robots};
 
 use super::client::{Call, Change, Exit, Guarded, follow, unary};
 use super::enrol::{self, Machine};

@@ -113,7 +113,8 @@ fn show(place: Option<v1::Place>, out: &Out) -> Result<v1::Place, Exit> {
     Ok(place)
 }
 
-async fn list(call: &Call, in_use: bool) -> Result<v1::ListPlacesResponse, Exit> {
+/// The places of a server, all or those in use.
+pub async fn list(call: &Call, in_use: bool) -> Result<v1::ListPlacesResponse, Exit> {
     let mut client = call.fleet().await?;
     let request = |page_token| unary(v1::ListPlacesRequest { in_use, page_size: PAGE_SIZE, page_token });
     Ok(pages::all(async |page_token| client.list_places(request(page_token)).await).await?)
@@ -144,22 +145,27 @@ impl Listed for v1::Place {
         self.place_id.clone()
     }
     fn row(&self) -> Vec<String> {
-        let holder = |h: &v1::PlaceHolder| {
-            let state = h.state().as_str_name().trim_start_matches("PLACE_HOLDER_STATE_").to_lowercase();
-            format!("{} {state}", h.robot_id)
-        };
-        let awaited = self.awaited_robot_ids.iter().map(|robot_id| format!("{robot_id} awaited"));
         vec![
             self.place_id.clone(),
             self.kind().as_str_name().trim_start_matches("PLACE_KIND_").to_owned(),
             self.rule().as_str_name().trim_start_matches("PLACE_RULE_").to_owned(),
             self.capacity.to_string(),
-            self.holders.iter().map(holder).chain(awaited).collect::<Vec<_>>().join(", "),
+            describe_holders(self),
             self.waiting_robot_ids.join(", "),
             describe_closure(self),
             self.etag.clone(),
         ]
     }
+}
+
+/// Who has a place, may enter it or is awaited there. Empty: nobody.
+pub fn describe_holders(place: &v1::Place) -> String {
+    let holder = |h: &v1::PlaceHolder| {
+        let state = h.state().as_str_name().trim_start_matches("PLACE_HOLDER_STATE_").to_lowercase();
+        format!("{} {state}", h.robot_id)
+    };
+    let awaited = place.awaited_robot_ids.iter().map(|robot_id| format!("{robot_id} awaited"));
+    place.holders.iter().map(holder).chain(awaited).collect::<Vec<_>>().join(", ")
 }
 
 /// What keeps robots out of a place, in a word or two. Empty: nothing.

@@ -122,7 +122,8 @@ fn document(robot: &v1::Robot, control: Option<&fleet::RobotControl>) -> anyhow:
     Ok(document)
 }
 
-async fn robots(call: &Call) -> Result<Vec<v1::Robot>, Exit> {
+/// All robots of a server.
+pub async fn robots(call: &Call) -> Result<Vec<v1::Robot>, Exit> {
     let mut client = call.telemetry().await?;
     let request = |page_token| unary(v1::ListRobotsRequest { filter: None, page_size: PAGE_SIZE, page_token });
     Ok(pages::all(async |page_token| client.list_robots(request(page_token)).await).await?.robots)
