@@ -218,6 +218,9 @@ mod tests {
         assert_eq!((of(1_040, Some(50)), of(960, Some(50))), (0, 0));
         assert_eq!((of(1_100, Some(50)), of(900, Some(50))), (700, -700));
         assert_eq!(of(2_000, None), 0, "the model's figures are nobody's");
-        assert_eq!(RobotEnergy { error_permille: Some(0), ..RobotEnergy::MODEL }.beyond_model_mwh(u64::MAX, u64::MAX), 0);
+        assert_eq!(
+            RobotEnergy { error_permille: Some(0), ..RobotEnergy::MODEL }.beyond_model_mwh(u64::MAX, u64::MAX),
+            0
+        );
     }
 }
