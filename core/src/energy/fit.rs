@@ -83,7 +83,7 @@ impl AttemptWork {
 pub struct EnergySums {
     /// Attempts; the older ones count less once they are many.
     pub attempts: u64,
-    /// Energy.
+    /// Energy of all of them.
     pub energy: u64,
     /// Squares of energy.
     pub energy_squares: u64,
