@@ -7,7 +7,7 @@ use midshift_core::fleet::WAITS_FOR;
 use midshift_core::reason::Code;
 use midshift_proto::common::v1::Reason;
 use midshift_proto::convert::{duration, time_of};
-use midshift_proto::fleet::v1::{PairCost, PlanChoice, TaskExplanation};
+use midshift_proto::fleet::v1::{PairCost, PlanChoice, RobotEnergy, TaskExplanation};
 
 /// The lines of an explanation that say what is done or waited for; `nothing`: in case there is no reason.
 pub fn verdict(reason: Option<&Reason>, nothing: &str) -> String {
@@ -57,6 +57,7 @@ fn cost(cost: &PairCost) -> String {
         ("way", cost.way_ms),
         ("failed it before", cost.failed_ms),
         ("charge", cost.charge_ms),
+        ("energy", cost.energy_ms),
         ("late", cost.lateness_ms),
         ("waited", cost.age_ms),
         ("meant for it before", cost.kept_ms),
@@ -65,6 +66,26 @@ fn cost(cost: &PairCost) -> String {
     let terms = terms.collect::<Vec<_>>().join(", ");
     let total = seconds(cost.total_ms);
     if terms.is_empty() { total } else { format!("{total} ({terms})") }
+}
+
+/// The line of a robot's explanation that says what its work takes from the battery.
+pub fn energy(energy: &RobotEnergy) -> String {
+    let thousandth = |value: u32| f64::from(value) / 1_000.0;
+    let rates = format!(
+        "{:.1} Wh a km, {:.1} with a load, {:.1} W standing, {:.2} Wh an action",
+        thousandth(energy.empty_mwh_per_km),
+        thousandth(energy.loaded_mwh_per_km),
+        thousandth(energy.idle_mw),
+        thousandth(energy.action_mwh),
+    );
+    let attempts = energy.attempts;
+    match energy.error_permille {
+        Some(error) => {
+            let percent = f64::from(error) / 10.0;
+            format!("  energy {rates}, fitted to {attempts} attempts, which lie {percent:.1} % beside it\n")
+        }
+        None => format!("  energy {rates}: figures of the model, its {attempts} attempts are too few\n"),
+    }
 }
 
 /// One code, or all.
@@ -112,6 +133,31 @@ mod tests {
             said,
             told.to_owned() + "  next r2: would weigh 7.5 s (way 9.0 s, waited -1.5 s), which went with T2\n"
         );
+    }
+
+    #[test]
+    fn the_energy_of_a_robot_is_told_with_its_error_or_as_the_models() {
+        let model = RobotEnergy {
+            empty_mwh_per_km: 120_000,
+            loaded_mwh_per_km: 156_000,
+            idle_mw: 80_000,
+            action_mwh: 500,
+            error_permille: None,
+            attempts: 3,
+        };
+        let rates = "  energy 120.0 Wh a km, 156.0 with a load, 80.0 W standing, 0.50 Wh an action";
+        assert_eq!(energy(&model), rates.to_owned() + ": figures of the model, its 3 attempts are too few\n");
+        let fitted = RobotEnergy { error_permille: Some(24), attempts: 57, ..model };
+        assert_eq!(energy(&fitted), rates.to_owned() + ", fitted to 57 attempts, which lie 2.4 % beside it\n");
+    }
+
+    #[test]
+    fn a_cost_names_the_energy_that_its_way_takes_more_or_less() {
+        let of = |energy_ms| {
+            cost(&PairCost { total_ms: 2_000 + energy_ms, way_ms: 2_000, energy_ms, ..PairCost::default() })
+        };
+        assert_eq!(of(700), "2.7 s (way 2.0 s, energy 0.7 s)");
+        assert_eq!(of(-300), "1.7 s (way 2.0 s, energy -0.3 s)");
     }
 
     #[test]

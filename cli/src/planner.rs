@@ -62,6 +62,10 @@ pub struct Rules {
     /// What must be gained, in time on the way, before a task is meant for another robot than it was; at most 60s.
     #[arg(long, value_parser = super::duration)]
     hysteresis: Option<Duration>,
+    /// What each watt-hour weighs that a robot takes more than a usual one on its way to a task, in milliseconds on the way;
+    /// 0: nothing.
+    #[arg(long, value_name = "MS")]
+    energy_weight: Option<u32>,
 }
 
 impl Rules {
@@ -80,6 +84,7 @@ impl Rules {
             ageing_permille: self.ageing.or(old.ageing_permille),
             lateness_permille: self.lateness.or(old.lateness_permille),
             hysteresis: self.hysteresis.map(super::area::milliseconds).or(old.hysteresis),
+            energy_ms_per_wh: self.energy_weight.or(old.energy_ms_per_wh),
             ..old
         }
     }
@@ -124,7 +129,7 @@ fn describe(policy: &v1::PlannerPolicy) -> String {
     let seconds = |time: &Option<prost_types::Duration>| time.as_ref().map_or(0.0, |t| ms_of(t) as f64 / 1_000.0);
     let number = |value: Option<u32>| value.unwrap_or_default();
     format!(
-        "{}  policy {word}  horizon {} s  hysteresis {} s\n  way: urgent {}, normal {}, background {}  ageing {} permille  lateness {} permille",
+        "{}  policy {word}  horizon {} s  hysteresis {} s\n  way: urgent {}, normal {}, background {}  ageing {} permille  lateness {} permille  energy {} ms a Wh",
         policy.site_id,
         seconds(&policy.horizon),
         seconds(&policy.hysteresis),
@@ -133,6 +138,7 @@ fn describe(policy: &v1::PlannerPolicy) -> String {
         number(policy.background_travel_weight),
         number(policy.ageing_permille),
         number(policy.lateness_permille),
+        number(policy.energy_ms_per_wh),
     )
 }
 
@@ -161,11 +167,12 @@ mod tests {
             ageing: Some(6),
             lateness: Some(5),
             hysteresis: Some(Duration::ZERO),
+            energy_weight: Some(4),
         };
         let new = all.over(old());
         assert_eq!((new.site_id.as_str(), new.etag.as_str()), ("hall", "7"));
         let shown = "hall  policy fifo-nearest  horizon 1.5 s  hysteresis 0 s\n  \
-                     way: urgent 9, normal 8, background 7  ageing 6 permille  lateness 5 permille";
+                     way: urgent 9, normal 8, background 7  ageing 6 permille  lateness 5 permille  energy 4 ms a Wh";
         assert_eq!(describe(&new), shown);
         let back = Rules { policy: Some(Policy::Rolling), ..Rules::default() }.over(new);
         assert_eq!(describe(&back), shown.replace("fifo-nearest", "rolling"));

@@ -407,6 +407,7 @@ async fn explain(one: &RobotTarget, out: &Out) -> Result<(), Exit> {
     out.one(&answer, &one.robot_id, || {
         let mut text = control_line(&e.control.clone().unwrap_or_default());
         text += &verdict(e.verdict.as_ref(), "nothing keeps it from work");
+        text += &e.energy.as_ref().map_or_else(String::new, super::explain::energy);
         let rows: Vec<Vec<String>> = e
             .candidates
             .iter()

@@ -18,8 +18,8 @@ const JOINT_TAU_S: f64 = 300.0;
 
 /// How the rates of a body's battery differ from the model's.
 ///
-/// The planner filters by the model alone: it keeps a tenth of what a trip costs, and a tenth of the battery. A test
-/// holds that this covers draws of up to 1,700.
+/// The planner filters by the model until it has fitted a robot's own rates: it keeps a tenth of what a trip costs, and
+/// a tenth of the battery. A test holds that this covers draws of up to 1,700.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct EnergyScale {
     /// Energy taken from the battery, thousandths of the model's.

@@ -1,7 +1,8 @@
 //! What the planner expects a trip to cost, and what it costs a simulated body.
 
 use midshift_agent::body::{Body, BodyNews, BodyOrder, PathPoint};
-use midshift_core::energy::{CAPACITY_MWH, Trip};
+use midshift_core::energy::fit::{AttemptWork, EnergySums, fit_robot};
+use midshift_core::energy::{CAPACITY_MWH, EnergyRates, RobotEnergy, Trip};
 use midshift_core::fleet::assignment::filters::RESERVE_PERMILLE;
 use midshift_core::ids::{RobotId, TaskId, WaypointId};
 use midshift_core::limits::STOP_SLOW_MM_S;
@@ -30,6 +31,8 @@ const HUNGRY_PERMILLE: u32 = 1_700;
 struct Cost {
     planned: u64,
     spent: u64,
+    /// What an agent would report of it.
+    work: AttemptWork,
 }
 
 struct Driver {
@@ -105,13 +108,17 @@ fn action(name: &str) -> StepKind {
 /// Transports, inspections and waits, one after the other.
 fn trip(seed: u64, draw_permille: u32) -> Cost {
     let mut driver = Driver::new(seed, draw_permille);
-    let mut trip = Trip::new(false, None);
+    let mut trip = Trip::new(&RobotEnergy::MODEL, false, None);
+    let mut actions = 0;
     let slowest = seed.is_multiple_of(4);
     driver.body.work_for(Some(&TaskId::parse("T1").expect("a task")), 0);
     for _ in 0..driver.rng.random_range(1..=4) {
         driver.drives(&mut trip, slowest);
         match driver.rng.random_range(0..3) {
-            0 => driver.acts(&mut trip, action("inspect")),
+            0 => {
+                driver.acts(&mut trip, action("inspect"));
+                actions += 1;
+            }
             1 => {
                 let duration_ms = driver.rng.random_range(0..60_000);
                 driver.acts(&mut trip, StepKind::Wait { duration_ms });
@@ -120,16 +127,34 @@ fn trip(seed: u64, draw_permille: u32) -> Cost {
                 driver.acts(&mut trip, action("pick"));
                 driver.drives(&mut trip, slowest);
                 driver.acts(&mut trip, action("place"));
+                actions += 2;
             }
         }
     }
-    Cost { planned: trip.needed_mwh(), spent: driver.body.state(driver.now).energy_mwh }
+    let state = driver.body.state(driver.now);
+    let work = AttemptWork {
+        empty_mm: state.odometer_mm - state.loaded_odometer_mm,
+        loaded_mm: state.loaded_odometer_mm,
+        duration_ms: driver.now.since(SiteTime(0)).as_ms(),
+        actions,
+        energy_mwh: state.energy_mwh,
+    };
+    Cost { planned: trip.needed_mwh(), spent: state.energy_mwh, work }
+}
+
+/// Rates of a body of this draw, by all the trips.
+fn fitted(draw_permille: u32) -> RobotEnergy {
+    let mut sums = EnergySums::default();
+    for seed in 0..SEEDS {
+        assert!(sums.add(&trip(seed, draw_permille).work), "seed {seed}: nothing about it is absurd");
+    }
+    fit_robot(&sums, std::iter::once(&sums))
 }
 
 #[test]
 fn no_trip_of_a_simulated_body_costs_more_than_was_planned_nor_far_less() {
     for seed in 0..SEEDS {
-        let Cost { planned, spent } = trip(seed, 1_000);
+        let Cost { planned, spent, .. } = trip(seed, 1_000);
         assert!(spent <= planned, "seed {seed}: {spent} mWh were spent, {planned} planned");
         let above = planned as f64 / spent as f64;
         assert!(above <= ABOVE_MAX, "seed {seed}: {planned} mWh were planned, {above:.2} times the {spent} spent");
@@ -141,7 +166,46 @@ fn a_hungry_body_spends_more_than_was_planned_and_never_the_reserve() {
     let reserve = CAPACITY_MWH as u64 * RESERVE_PERMILLE / 1_000;
     let costs: Vec<Cost> = (0..SEEDS).map(|seed| trip(seed, HUNGRY_PERMILLE)).collect();
     assert!(costs.iter().any(|cost| cost.spent > cost.planned), "the margin alone is not enough");
-    for Cost { planned, spent } in costs {
+    for Cost { planned, spent, .. } in costs {
         assert!(spent <= planned + reserve / 4, "{spent} mWh were spent, {planned} planned");
+    }
+}
+
+#[test]
+fn rates_that_are_fitted_to_a_simulated_body_are_its_own_and_explain_its_trips() {
+    for draw_permille in [1_000, 2_000] {
+        let robot = fitted(draw_permille);
+        let EnergyRates { empty_mwh_per_km, loaded_mwh_per_km, idle_mw, action_mwh } = robot.rates;
+        let model = EnergyRates::MODEL;
+        let rates = [
+            (empty_mwh_per_km, model.empty_mwh_per_km),
+            (loaded_mwh_per_km, model.loaded_mwh_per_km),
+            (idle_mw, model.idle_mw),
+            // An inspection is shorter than a pick, so an action takes somewhat less than that.
+            (action_mwh, model.action_mwh * 9 / 10),
+        ];
+        for (found, usual) in rates {
+            let off = f64::from(found) / f64::from(usual) / f64::from(draw_permille) * 1_000.0 - 1.0;
+            assert!(off.abs() < 0.1, "draw {draw_permille}: {robot:?}");
+        }
+        assert!(robot.error_permille.is_some_and(|error| error <= 20), "draw {draw_permille}: {robot:?}");
+    }
+}
+
+#[test]
+fn a_hungry_body_that_is_known_spends_less_than_is_planned() {
+    let hungry = fitted(HUNGRY_PERMILLE);
+    let margin = |robot: &RobotEnergy| {
+        let mut trip = Trip::new(robot, false, None);
+        trip.drive(100_000);
+        trip.needed_mwh() as f64
+    };
+    let times = margin(&hungry) / margin(&RobotEnergy::MODEL);
+    for seed in 0..SEEDS {
+        let Cost { planned, spent, .. } = trip(seed, HUNGRY_PERMILLE);
+        assert!(
+            spent as f64 <= planned as f64 * times,
+            "seed {seed}: {spent} mWh were spent, {planned} planned before"
+        );
     }
 }

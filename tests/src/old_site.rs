@@ -235,6 +235,7 @@ impl OldSite {
             errands: WorkStats::default(),
             attached_ms: 1,
             counted: if is_retired { self.from } else { self.until },
+            energy_sums: Default::default(),
         };
         fleet.create(&control, "robot.retired").create(&counter, "robot.counted");
         let presence = PresenceRow::new(robot_id.clone(), Presence::Offline, self.from.0);

@@ -124,6 +124,7 @@ pub fn encode_planner(policy: &PlannerPolicy, revision: Option<Revision>) -> v1:
         ageing_permille: Some(policy.ageing_permille),
         lateness_permille: Some(policy.lateness_permille),
         hysteresis: Some(duration(policy.hysteresis_ms)),
+        energy_ms_per_wh: Some(policy.energy_ms_per_wh),
     }
 }
 
@@ -163,6 +164,7 @@ pub fn parse_planner(
         ageing_permille: wire.ageing_permille.unwrap_or(default.ageing_permille),
         lateness_permille: wire.lateness_permille.unwrap_or(default.lateness_permille),
         hysteresis_ms,
+        energy_ms_per_wh: wire.energy_ms_per_wh.unwrap_or(default.energy_ms_per_wh),
     };
     policy.check_for(site_id, &at.to_string(), bad);
     (bad.0.len() == before).then_some(policy)

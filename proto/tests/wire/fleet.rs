@@ -62,7 +62,7 @@ fn rules_of_the_planner_take_defaults_for_what_is_absent_and_come_back_whole() {
     assert_eq!(planner(v1::PlannerPolicy::default()), Ok(default.clone()));
     let wire = json!({"siteId": "hall", "policy": "ASSIGNMENT_POLICY_FIFO_NEAREST", "horizon": "0s", "hysteresis": "1.5s",
         "urgentTravelWeight": 9, "normalTravelWeight": 8, "backgroundTravelWeight": 7, "ageingPermille": 0,
-        "latenessPermille": 6});
+        "latenessPermille": 6, "energyMsPerWh": 0});
     let put = PlannerPolicy {
         policy: AssignmentPolicy::FifoNearest,
         horizon_ms: 0,
@@ -72,6 +72,7 @@ fn rules_of_the_planner_take_defaults_for_what_is_absent_and_come_back_whole() {
         ageing_permille: 0,
         lateness_permille: 6,
         hysteresis_ms: 1_500,
+        energy_ms_per_wh: 0,
         ..default
     };
     assert_eq!(planner(from_json(wire).expect("json")), Ok(put.clone()));
@@ -94,6 +95,7 @@ fn rules_of_the_planner_hear_every_rule_they_break() {
         ageing_permille: Some(10_001),
         lateness_permille: Some(10_001),
         hysteresis: Some(prost_types::Duration { seconds: 1, nanos: -1 }),
+        energy_ms_per_wh: Some(10_001),
         ..v1::PlannerPolicy::default()
     };
     let fields = [
@@ -106,6 +108,7 @@ fn rules_of_the_planner_hear_every_rule_they_break() {
         "background_travel_weight",
         "ageing_permille",
         "lateness_permille",
+        "energy_ms_per_wh",
     ];
     assert_eq!(planner(broken), Err(fields.map(|field| format!("policy.{field}")).to_vec()));
     for policy in [0, 99] {

@@ -1,5 +1,6 @@
 //! Rows and explanations as their messages. Nothing is decided here.
 
+use midshift_core::energy::RobotEnergy;
 use midshift_core::fleet::explain::{RobotExplanation, TaskExplanation};
 use midshift_core::fleet::projection::FleetProjection;
 use midshift_core::fleet::projection::chosen::{PairCost, PlanChoice};
@@ -211,6 +212,7 @@ fn pair_cost(cost: &PairCost) -> v1::PairCost {
         lateness_ms: cost.lateness / PairCost::UNITS_PER_MS,
         age_ms: cost.age / PairCost::UNITS_PER_MS,
         kept_ms: cost.kept / PairCost::UNITS_PER_MS,
+        energy_ms: cost.energy / PairCost::UNITS_PER_MS,
     }
 }
 
@@ -236,6 +238,18 @@ pub fn robot_explanation(
             .collect(),
         explain_time: Some(timestamp(now.utc)),
         control: Some(control(view, board, robot_id)),
+        energy: Some(robot_energy(&e.energy)),
+    }
+}
+
+fn robot_energy(energy: &RobotEnergy) -> v1::RobotEnergy {
+    v1::RobotEnergy {
+        empty_mwh_per_km: energy.rates.empty_mwh_per_km,
+        loaded_mwh_per_km: energy.rates.loaded_mwh_per_km,
+        idle_mw: energy.rates.idle_mw,
+        action_mwh: energy.rates.action_mwh,
+        error_permille: energy.error_permille,
+        attempts: energy.attempts,
     }
 }
 

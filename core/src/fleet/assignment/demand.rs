@@ -2,7 +2,7 @@
 //!
 //! Made by whoever asks `filters`. Reads only. Invariant: nothing in it depends on a robot.
 
-use crate::energy::Trip;
+use crate::energy::{RobotEnergy, Trip};
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::WaypointId;
 use crate::reason::{Code, Reason};
@@ -57,14 +57,20 @@ impl<'a> Demand<'a> {
         Ok(first_mm.into_iter().chain(onward_mm.iter().copied()))
     }
 
-    /// What all of it costs a robot that stands here with a load or without, and the way to the nearest charger behind it. None: the site
-    /// has no chargers.
-    pub fn trip_home(&self, view: &FleetProjection, here: WaypointIx, has_load: bool) -> Result<Option<Trip>, Reason> {
+    /// What all of it costs a robot of this `energy` that stands here with a load or without, and the way to the nearest charger behind it.
+    /// None: the site has no chargers.
+    pub fn trip_home(
+        &self,
+        view: &FleetProjection,
+        energy: &RobotEnergy,
+        here: WaypointIx,
+        has_load: bool,
+    ) -> Result<Option<Trip>, Reason> {
         if view.site.chargers().next().is_none() {
             return Ok(None);
         }
         let spec = &self.intake.spec;
-        let mut trip = Trip::new(has_load, spec.speed_limit_mm_s);
+        let mut trip = Trip::new(energy, has_load, spec.speed_limit_mm_s);
         let mut legs_mm = self.legs_mm(here)?;
         for step in &spec.steps[step::from_step(&spec.steps, self.task.next_step) as usize..] {
             match &step.kind {

@@ -110,7 +110,8 @@ pub(super) fn pair_if_able(
         return Err(Reason::from(Code::RouteTooLong).with("points_max", limits::ROUTE_POINTS_MAX));
     }
     // The charge must last for all of it and the way to a charger behind it, with a reserve.
-    let Some(trip) = demand.trip_home(view, here, load.is_some())? else { return Ok(()) };
+    let energy = view.energy_of(robot_id);
+    let Some(trip) = demand.trip_home(view, energy, here, load.is_some())? else { return Ok(()) };
     let mandatory = u64::from(view.policy(&view.site.area_of(here).area_id).charge_mandatory_permille);
     let needed = (trip.needed_permille() + RESERVE_PERMILLE).max(mandatory);
     let has = u64::from(live.report.vitals.battery_permille);

@@ -1,6 +1,7 @@
 //! Why a task is not running and why a robot has no work: the planner's own filters, run again for one of them. Stores nothing.
 
 use super::wait_reasons;
+use crate::energy::RobotEnergy;
 use crate::fleet::assignment::demand::Demand;
 use crate::fleet::assignment::filters;
 use crate::fleet::decision::report::WAITS_FOR;
@@ -188,6 +189,8 @@ pub struct RobotExplanation {
     pub verdict: Option<Reason>,
     /// Waiting tasks in the order in which they are served.
     pub candidates: Vec<TaskCandidate>,
+    /// What its work costs, by which it is planned.
+    pub energy: RobotEnergy,
 }
 
 /// Explains one robot; none if it never connected, nor was refused.
@@ -196,9 +199,10 @@ pub fn robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotI
     if !view.unknown_rows.names(robot_id) && refused.is_none() {
         view.sessions.get(robot_id.as_str())?;
     }
+    let energy = *view.energy_of(robot_id);
     if let Err(unread) = view.unknown_rows.check_robot(robot_id) {
         let verdict = Some(wait_reasons::about_robot(unread, robot_id));
-        return Some(RobotExplanation { verdict, candidates: Vec::new() });
+        return Some(RobotExplanation { verdict, candidates: Vec::new(), energy });
     }
     let at = board.get(robot_id).and_then(|l| routing::find(view, l.report.vitals.waypoint.as_ref()));
     let candidates = view.queue.ready().take(CANDIDATES_MAX).filter_map(|task_id| {
@@ -223,7 +227,7 @@ pub fn robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotI
     };
     let verdict = refused.or_else(|| wait_reasons::of_robot(view, board, now, robot_id)).or_else(kept).or_else(barred);
     let verdict = verdict.map(|why| wait_reasons::about_robot(why, robot_id));
-    Some(RobotExplanation { verdict, candidates })
+    Some(RobotExplanation { verdict, candidates, energy })
 }
 
 /// The reason, if it names a closed place that bars the way.

@@ -18,6 +18,8 @@ pub struct PairCost {
     pub failed: i64,
     /// Charge that it would not get now.
     pub charge: i64,
+    /// Energy that its way takes beside that of a usual robot: less than 0 if less.
+    pub energy: i64,
     /// How late it would be there: at most 0.
     pub lateness: i64,
     /// How long the task has waited: at most 0.
@@ -34,7 +36,15 @@ impl PairCost {
 
     /// All terms.
     pub const fn sum(&self) -> i64 {
-        self.ready + self.way + self.failed + self.charge + self.lateness + self.age + self.kept + self.tie
+        self.ready
+            + self.way
+            + self.failed
+            + self.charge
+            + self.energy
+            + self.lateness
+            + self.age
+            + self.kept
+            + self.tie
     }
 }
 

@@ -6,8 +6,11 @@
 
 use super::broken_steps::{StepAt, StepChange};
 use super::queue::{Ended, TASKS_PER_TURN, Wait};
-use super::rows::{Drain, HoldToken, Incident, Place, PlaceBlock, RobotAuthority, RobotControl, RobotHolder};
+use super::rows::{
+    Drain, HoldToken, Incident, Place, PlaceBlock, RobotAuthority, RobotControl, RobotCounter, RobotHolder,
+};
 use super::state::FleetProjection;
+use crate::energy::fit::fit_robot;
 use crate::ids::{RobotId, TaskId};
 use crate::policy::AreaPolicy;
 use crate::projection::Indexed;
@@ -150,6 +153,22 @@ impl Indexed<RobotControl> for FleetProjection {
         if new.and_then(word) != old.and_then(word) {
             view.dirty.extend(new.map(|control| control.robot_id.clone()));
         }
+    }
+}
+
+impl Indexed<RobotCounter> for FleetProjection {
+    /// The rates of a robot's energy follow from all that was counted of it.
+    fn changed(view: &mut Self, id: &str, old: Option<&RobotCounter>) {
+        let new = view.counters.get(id).map(|c| &c.row);
+        let Some(robot_id) = new.or(old).map(|counter| counter.robot_id.clone()) else { return };
+        let newest = view.counters_of(&robot_id).max_by_key(|counter| counter.counted);
+        let energy = newest.map(|newest| {
+            fit_robot(&newest.energy_sums, view.counters_of(&robot_id).map(|counter| &counter.energy_sums))
+        });
+        match energy.filter(|energy| energy.attempts > 0) {
+            Some(energy) => view.energy.insert(robot_id, energy),
+            None => view.energy.remove(&robot_id),
+        };
     }
 }
 

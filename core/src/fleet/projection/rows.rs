@@ -1,6 +1,7 @@
 //! Rows that fleet alone writes, apart from tasks and attempts: places, the robot's mutex, control, timers, holds, counters, marks.
 
 use super::command::Command;
+use crate::energy::fit::EnergySums;
 use crate::ids::{AreaId, AttemptId, DrainId, PlaceId, RobotId, RolloutId, SiteId, StopId, TaskId};
 use crate::reason::Reason;
 use crate::robot::{Duty, Inventory};
@@ -374,6 +375,9 @@ pub struct RobotCounter {
     /// When it was counted last, UTC, site clock; 0: before this was noted.
     #[serde(default)]
     pub counted: Utc,
+    /// What attempts took, errands of parking included: from it follow the rates of the robot's energy.
+    #[serde(default, skip_serializing_if = "EnergySums::is_empty")]
+    pub energy_sums: EnergySums,
 }
 
 impl Record for RobotCounter {

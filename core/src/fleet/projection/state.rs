@@ -16,6 +16,7 @@ use super::same_key::SameKey;
 use super::start_estimates::Starts;
 use crate::desired_state::{DesiredPolicy, DesiredWork};
 use crate::drain_request::{DrainRelease, DrainRequest};
+use crate::energy::RobotEnergy;
 use crate::fleet::bugs::Bugs;
 use crate::identity::RobotIdentity;
 use crate::ids::{AttemptId, RobotId, TaskId};
@@ -53,7 +54,7 @@ projection! {
         /// Cordons and breakers.
         control: RobotControl = RobotControl Indexed;
         /// Work done.
-        counters: RobotCounter = RobotCounter;
+        counters: RobotCounter = RobotCounter Indexed;
         /// The site row.
         sites: SiteRow = Site;
         /// Rules of areas.
@@ -164,6 +165,8 @@ projection! {
         engaged: BTreeSet<String> = BTreeSet::new();
         /// A stop was engaged or reset since tokens were last put right.
         stops_changed: bool = false;
+        /// What the work of robots costs by what they did; none: nothing was counted of it. Read by [`FleetProjection::energy_of`].
+        energy: BTreeMap<RobotId, RobotEnergy> = BTreeMap::new();
         /// Robots that have an attempt.
         at_work: BTreeSet<RobotId> = BTreeSet::new();
         /// Places a robot holds: robot → place ids.
@@ -260,6 +263,17 @@ impl FleetProjection {
     pub fn robot_holds(&self, robot: &RobotId) -> impl Iterator<Item = &HoldToken> {
         let from = format_smolstr!("robot:{robot}:");
         self.holds.range(from.clone()..).take_while(move |(id, _)| id.starts_with(&*from)).map(|(_, h)| &h.row)
+    }
+
+    /// What the robot's work costs, as far as its attempts say; else as the model says.
+    pub fn energy_of(&self, robot: &RobotId) -> &RobotEnergy {
+        self.energy.get(robot).unwrap_or(&RobotEnergy::MODEL)
+    }
+
+    /// Work done by the robot, by version of its software.
+    pub fn counters_of(&self, robot: &RobotId) -> impl Iterator<Item = &RobotCounter> {
+        let from = format_smolstr!("{robot}@");
+        self.counters.range(from.clone()..).take_while(move |(id, _)| id.starts_with(&*from)).map(|(_, c)| &c.row)
     }
 
     /// Rules of the planner. Also the default while their row is one of a newer version: robots get work, and a person

@@ -3,7 +3,8 @@
 //! Called by every room that has news of a task. Invariant: only here does a task change its phase, and only by
 //! `task::machine::next`.
 
-use super::{arrivals, attempts, breaker, eligibility, load, place_breaker, plausible};
+use super::{arrivals, attempts, breaker, eligibility, energy_sums, load, place_breaker, plausible};
+use crate::energy::fit::EnergySums;
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::{HolderState, RobotAuthority, RobotCounter, RobotHolder, Timer, TimerKind};
 use crate::fleet::projection::state::FleetProjection;
@@ -217,6 +218,9 @@ pub fn end_attempt(tx: &mut Tx, a: &mut Attempt) {
 fn count(tx: &mut Tx, a: &Attempt) {
     let mut counter = counter(tx, &a.robot_id, &a.software);
     counter.stats += a.stats;
+    if let Some(work) = energy_sums::work_of(tx.view, a) {
+        counter.energy_sums.add(&work);
+    }
     if a.errand.is_some() {
         counter.errands += a.stats;
     } else {
@@ -251,6 +255,7 @@ fn counter(tx: &mut Tx, robot_id: &RobotId, software: &str) -> RobotCounter {
         errands: crate::robot_events::WorkStats::default(),
         attached_ms: 0,
         counted: tx.now.utc,
+        energy_sums: EnergySums::default(),
     });
     counter.counted = tx.now.utc;
     counter.attached_ms += tx.view.attached.get_mut(robot_id).map_or(0, |heard| std::mem::take(&mut heard.ms));

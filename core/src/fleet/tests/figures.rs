@@ -56,6 +56,7 @@ fn robots_are_counted_by_what_has_them_and_way_by_work_and_load() {
         errands: stats(1_000, 0),
         attached_ms: 0,
         counted: rig.now.utc,
+        energy_sums: Default::default(),
     });
     let figures = FleetFigures::new(&rig.view, &rig.board, &rig.now);
     let robots = |does| figures.robots[does];

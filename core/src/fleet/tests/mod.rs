@@ -17,6 +17,7 @@ mod opened;
 mod order;
 mod planner;
 mod preemption;
+mod robot_energy;
 mod rolling;
 mod same_key;
 mod same_robot;

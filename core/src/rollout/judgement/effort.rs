@@ -117,6 +117,7 @@ mod tests {
             errands: stats(100_000, 100_000, 30),
             attached_ms: 0,
             counted: Utc(0),
+            energy_sums: Default::default(),
         };
         let expected = Effort {
             tasks: 10,

@@ -187,6 +187,7 @@ impl Rig {
             errands: WorkStats::default(),
             attached_ms: 0,
             counted: Default::default(),
+            energy_sums: Default::default(),
         });
         if well {
             row.succeeded += 1;

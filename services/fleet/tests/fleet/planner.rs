@@ -101,6 +101,7 @@ async fn all_that_is_wrong_with_rules_of_the_planner_is_told_at_once() {
         ageing_permille: Some(10_001),
         lateness_permille: Some(10_001),
         hysteresis: Some(before_now),
+        energy_ms_per_wh: Some(10_001),
         ..Default::default()
     };
     let request_id = "not one".to_owned();
@@ -112,6 +113,7 @@ async fn all_that_is_wrong_with_rules_of_the_planner_is_told_at_once() {
     let rules = [
         "ageing_permille",
         "background_travel_weight",
+        "energy_ms_per_wh",
         "horizon",
         "hysteresis",
         "lateness_permille",

@@ -211,6 +211,7 @@ async fn an_incident_is_shown_and_closed_where_what_it_is_about_is() {
         errands: Default::default(),
         attached_ms: 1,
         counted: Default::default(),
+        energy_sums: Default::default(),
     };
     w.left_behind(&[counter("r1"), counter("r2")]).await;
     w.start_fleet();

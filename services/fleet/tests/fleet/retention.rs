@@ -117,6 +117,7 @@ async fn of_a_robot_the_newest_counter_stays_and_older_ones_go_after_a_month() {
         errands: Default::default(),
         attached_ms: 1,
         counted: Utc(BEGIN.0 - days * DAY_MS),
+        energy_sums: Default::default(),
     };
     w.left_behind(&[counter("0.8.0", 50), counter("0.9.0", 40)]).await;
     prune(&w).await;
@@ -234,6 +235,7 @@ async fn day_of_work(w: &World, day: u64) {
         errands: Default::default(),
         attached_ms: 1,
         counted: now,
+        energy_sums: Default::default(),
     };
     w.left_behind(&[counter]).await;
 }

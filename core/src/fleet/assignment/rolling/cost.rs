@@ -53,17 +53,27 @@ pub fn of_pair(policy: &PlannerPolicy, now: &Now, robot: &Robot, urgency: &Urgen
         left_ms -= counted;
         weight * units(counted)
     };
+    let energy_mwh = robot.energy.beyond_model_mwh(pair.way_mm, way_ms);
     let meant_ms = if pair.is_meant { policy.hysteresis_ms } else { 0 };
     PairCost {
         ready: of_way(robot.ready_ms),
         way: of_way(way_ms),
         failed: of_way(failed_ms),
         charge: of_way(robot.loss_ms),
+        energy: energy(energy_mwh, policy),
         lateness: -units(late_ms) * i64::from(policy.lateness_permille) / 1_000,
         age: -units(age_ms) * i64::from(policy.ageing_permille) / 1_000,
         kept: -weight * units(meant_ms),
         tie: robot.tasks.min(UNITS_PER_MS as u64 - 1) as i64,
     }
+}
+
+/// What so many milliwatt-hours weigh, no more than one term may. What takes less weighs less than nothing.
+fn energy(mwh: i64, policy: &PlannerPolicy) -> i64 {
+    // A thousandth of a watt-hour for a thousandth of a millisecond.
+    const { assert!(UNITS_PER_MS == 1_000) };
+    let most = units(TERM_MS_MAX);
+    mwh.saturating_mul(policy.energy_ms_per_wh.into()).clamp(-most, most)
 }
 
 fn units(ms: u64) -> i64 {

@@ -2,7 +2,7 @@
 //!
 //! Invariant: only a robot that is free gets an offer; the others keep tasks from going to a robot that is farther away.
 
-use crate::energy;
+use crate::energy::{self, RobotEnergy};
 use crate::fleet::assignment::estimate::{Rest, USUAL_MM_S};
 use crate::fleet::assignment::filters;
 use crate::fleet::projection::liveness::Board;
@@ -57,6 +57,8 @@ pub struct Robot {
     pub is_low: bool,
     /// Tasks that it was given so far.
     pub tasks: u64,
+    /// What its work costs.
+    pub energy: RobotEnergy,
 }
 
 /// Robots that are free, or whose errand may be broken off, by id.
@@ -133,7 +135,8 @@ pub fn find_soon(view: &FleetProjection, board: &Board, now: &Now, horizon_ms: u
 
 fn robot(view: &FleetProjection, robot_id: &RobotId, at: WaypointIx, free: Free, ready_ms: u64) -> Robot {
     let tasks = view.control.get(robot_id.as_str()).map_or(0, |c| c.row.tasks);
-    Robot { robot_id: robot_id.clone(), at, free, ready_ms, loss_ms: 0, is_low: false, tasks }
+    let energy = *view.energy_of(robot_id);
+    Robot { robot_id: robot_id.clone(), at, free, ready_ms, loss_ms: 0, is_low: false, tasks, energy }
 }
 
 /// Whether a robot must charge before it does anything, on a site where it can.

@@ -486,7 +486,7 @@ impl Robot {
         };
         self.attempts.retain(|a| a.attempt != *attempt);
         self.attempts.push(listed);
-        let stats = WorkStats { path_mm: 1_000, duration_ms: 1_000, ..WorkStats::default() };
+        let stats = WorkStats { path_mm: 1_000, duration_ms: 1_000, energy_mwh: 1_000, ..WorkStats::default() };
         let report = AttemptReport {
             attempt: attempt.clone(),
             state,

@@ -138,6 +138,7 @@ impl Rig {
             errands: WorkStats::default(),
             attached_ms: 0,
             counted: Utc(0),
+            energy_sums: Default::default(),
         })]);
     }
     fn pass(&mut self, secs: u64) {
