@@ -8,7 +8,7 @@ use clap::Subcommand;
 use midshift_core::ids::WaypointId;
 use midshift_core::site::show::{Occupants, PlacedRobot};
 use midshift_core::site::{Site, grid, lif, lint, show, text};
-use midshift_proto::telemetry::v1;
+use midshift_proto::{fleet::v1 as fleet, telemetry::v1};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -72,7 +72,12 @@ fn document(site: &Site, occupants: Option<&Occupants>) -> serde_json::Value {
 async fn find_occupants(call: &Call, site: &Site) -> Result<Occupants, Exit> {
     let robots = robot::robots(call).await?.iter().filter_map(|robot| place_robot(site, robot)).collect();
     let places = zone::list(call, true).await?.places;
-    let held = places.iter().map(|place| (place.place_id.clone(), zone::describe_holders(place))).collect();
+    let words = |place: &fleet::Place| {
+        let words = [zone::describe_holders(place), zone::describe_closure(place)];
+        words.into_iter().filter(|words| !words.is_empty()).collect::<Vec<_>>().join(", ")
+    };
+    let held = places.iter().map(|place| (place.place_id.clone(), words(place)));
+    let held = held.filter(|(_, words)| !words.is_empty()).collect();
     Ok(Occupants { robots, held })
 }
 

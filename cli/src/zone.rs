@@ -91,7 +91,9 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             };
             let answer = call.fleet().await?.block_place(unary(request)).await?.into_inner();
             let place = show(answer.place, out)?;
-            out.next(&format!("midshift zone unblock {} --reason TEXT", place.place_id));
+            if !change.dry_run {
+                out.next(&format!("midshift zone unblock {} --reason TEXT", place.place_id));
+            }
             Ok(())
         }
         Verb::Unblock { call, place_id, reason, change } => {
@@ -169,7 +171,7 @@ pub fn describe_holders(place: &v1::Place) -> String {
 }
 
 /// What keeps robots out of a place, in a word or two. Empty: nothing.
-fn describe_closure(place: &v1::Place) -> String {
+pub fn describe_closure(place: &v1::Place) -> String {
     let until = |until: &Timestamp| format!(" until {}", time_of(until).rfc3339());
     let block = |block: &v1::PlaceBlock| format!("blocked{}", block.until.as_ref().map_or_else(String::new, until));
     let words = place.quarantine.iter().map(|reason| reason.code.clone()).chain(place.block.iter().map(block));

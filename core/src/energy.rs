@@ -31,6 +31,9 @@ pub const ACTION_VARIES_PERMILLE: u64 = 200;
 const MARGIN_PERMILLE: u64 = 100;
 /// The error of a robot's own rates adds no more than this to the margin, thousandths.
 const ERROR_MARGIN_MAX_PERMILLE: u64 = 300;
+/// Rates by which a robot is sent somewhere, thousandths of the model's: one that counts its motors alone would not come home, and one
+/// that counts too much would never be sent.
+const PLANNED_PERMILLE: std::ops::RangeInclusive<u32> = 700..=2_000;
 /// Nanowatt-hours of a milliwatt-hour.
 const NWH_PER_MWH: u64 = 1_000_000;
 
@@ -56,6 +59,19 @@ impl EnergyRates {
         action_mwh: (ACT_W * HANDLE.as_ms() as f64 / 3_600.0 + 0.5) as u32,
     };
 
+    /// As far as they are believed where a robot is sent somewhere: it must come home, and must not starve.
+    fn planned(&self) -> Self {
+        let within = |own: u32, by_model: u32| {
+            let times = |permille: u32| (u64::from(by_model) * u64::from(permille) / 1_000) as u32;
+            own.clamp(times(*PLANNED_PERMILLE.start()), times(*PLANNED_PERMILLE.end()))
+        };
+        Self {
+            empty_mwh_per_km: within(self.empty_mwh_per_km, Self::MODEL.empty_mwh_per_km),
+            loaded_mwh_per_km: within(self.loaded_mwh_per_km, Self::MODEL.loaded_mwh_per_km),
+            idle_mw: within(self.idle_mw, Self::MODEL.idle_mw),
+            action_mwh: within(self.action_mwh, Self::MODEL.action_mwh),
+        }
+    }
     /// Nanowatt-hours of so many millimetres without a load, or with one, without the time that they take.
     fn drive_nwh(&self, mm: u64, is_loaded: bool) -> u64 {
         mm.saturating_mul(u64::from(if is_loaded { self.loaded_mwh_per_km } else { self.empty_mwh_per_km }))
@@ -115,7 +131,13 @@ impl Trip {
     /// Of a robot that carries something or not, in a task with this speed limit.
     pub fn new(robot: &RobotEnergy, is_loaded: bool, speed_limit_mm_s: Option<u32>) -> Self {
         let speed_mm_s = speed_limit_mm_s.unwrap_or(STOP_SLOW_MM_S).clamp(1, STOP_SLOW_MM_S);
-        Self { rates: robot.rates, margin_permille: robot.margin_permille(), spent_nwh: 0, is_loaded, speed_mm_s }
+        Self {
+            rates: robot.rates.planned(),
+            margin_permille: robot.margin_permille(),
+            spent_nwh: 0,
+            is_loaded,
+            speed_mm_s,
+        }
     }
     /// Drives so many millimetres, as slowly as a robot may have to.
     pub fn drive(&mut self, mm: u64) {
@@ -198,6 +220,12 @@ mod tests {
         let double = RobotEnergy { rates, error_permille: Some(0), attempts: 30 };
         let usual = trip(&RobotEnergy::MODEL);
         assert!((2 * usual - 2..=2 * usual).contains(&trip(&double)), "twice {usual}, rounded once: {}", trip(&double));
+        let quarter =
+            EnergyRates { empty_mwh_per_km: empty_mwh_per_km / 4, idle_mw: idle_mw / 4, ..EnergyRates::MODEL };
+        let low = trip(&RobotEnergy { rates: quarter, error_permille: Some(0), attempts: 30 });
+        assert!(low > usual * 7 / 10, "who says too little is believed so far only: {low} beside {usual}");
+        let four = EnergyRates { empty_mwh_per_km: 4 * empty_mwh_per_km, ..rates };
+        assert_eq!(trip(&RobotEnergy { rates: four, ..double }), trip(&double), "and who says too much");
         let erring = |permille| trip(&RobotEnergy { error_permille: Some(permille), ..double });
         assert_eq!(erring(200) / 100, trip(&double) * 13 / 11 / 100, "the margin is three tenths, not one");
         assert_eq!(erring(u32::MAX), erring(300), "whatever its error, the margin has an end");

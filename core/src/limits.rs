@@ -221,6 +221,8 @@ pub const CLAIMED_PLACES_MAX: usize = 8;
 pub const CLAIMED_PLACE_MARGIN_MM: i32 = 3_000;
 /// After a restore the store does not know what it gave since the backup: for so long nothing unknown is held against a robot that knows more.
 pub const RESTORED_LATELY: SiteDuration = SiteDuration::from_secs(600);
+/// Charge that must be left at the charger, permille: an hour and a half of waiting on the way.
+pub const CHARGE_RESERVE_PERMILLE: u64 = 100;
 /// Places that one robot holds: its end takes them all back in one item, beside its timers and counters.
 pub const PLACES_OF_ROBOT_MAX: usize = 128;
 /// A decision that the store refused for good so often is put aside: the second refusal shows that trying again does not help.

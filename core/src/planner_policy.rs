@@ -108,7 +108,7 @@ impl PlannerPolicy {
         within("ageing_permille", self.ageing_permille.into(), 0, 10_000, " permille");
         within("lateness_permille", self.lateness_permille.into(), 0, 10_000, " permille");
         within("hysteresis", self.hysteresis_ms, 0, 60_000, " ms");
-        within("energy_ms_per_wh", self.energy_ms_per_wh.into(), 0, 10_000, " ms");
+        within("energy_ms_per_wh", self.energy_ms_per_wh.into(), 0, 5_000, " ms");
     }
 }
 
@@ -142,7 +142,7 @@ mod tests {
             ageing_permille: 10_001,
             lateness_permille: 10_001,
             hysteresis_ms: 60_001,
-            energy_ms_per_wh: 10_001,
+            energy_ms_per_wh: 5_001,
             ..good
         };
         let fields = [

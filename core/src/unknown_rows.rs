@@ -85,6 +85,11 @@ impl UnknownRows {
     pub fn is_place_aside(&self, place_id: &PlaceId) -> bool {
         !self.0.is_empty() && self.0.contains_key(&Key::new(Table::PlaceGrant, place_id.as_str()))
     }
+    /// Places of which a block is aside: nobody knows whether it holds.
+    pub fn blocked_places(&self) -> impl Iterator<Item = PlaceId> + '_ {
+        let blocks = self.0.keys().filter(|key| key.table == Table::PlaceBlock);
+        blocks.filter_map(|key| PlaceId::parse(&key.id).ok())
+    }
     /// What no person was told of yet, each once, with a robot that it is about.
     pub fn take_untold(&mut self) -> Vec<(Reason, Option<RobotId>)> {
         let untold =

@@ -180,12 +180,6 @@ impl Router {
     pub fn route_around(&self, from: WaypointIx, to: WaypointIx, blocked: &Blocked) -> Option<Vec<WaypointIx>> {
         self.field_around(to, blocked).route(from)
     }
-    /// The nearest of `goals` by distance, then by index; none if no lanes lead to any.
-    pub fn nearest(&self, from: WaypointIx, goals: impl IntoIterator<Item = WaypointIx>) -> Option<(WaypointIx, u64)> {
-        let reached = goals.into_iter().filter_map(|g| self.distance_mm(from, g).map(|d| (d, g)));
-        reached.min().map(|(d, g)| (g, d))
-    }
-
     fn remembered(&self) -> std::sync::MutexGuard<'_, LruCache<(WaypointIx, Blocked), Arc<DistanceField>>> {
         self.fields.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -248,7 +242,7 @@ pub fn segments(site: &Site, route: &[WaypointIx]) -> Vec<Segment> {
 mod tests {
     use super::*;
     use crate::ids::WaypointId;
-    use crate::site::{CORRIDOR, DEMO, Kind, text};
+    use crate::site::{CORRIDOR, DEMO, text};
 
     fn site(text: &str) -> Arc<Site> {
         Arc::new(text::parse(text).expect("reads"))
@@ -331,14 +325,5 @@ mod tests {
             });
             assert_eq!(queued, ordered, "to {}", site.name_of(goal));
         }
-    }
-
-    #[test]
-    fn the_nearest_goal_is_by_distance_then_by_index() {
-        let site = site(CORRIDOR);
-        let router = Router::new(site.clone());
-        let (nearest, _) = router.nearest(at(&site, "A"), site.of_kind(Kind::Hold)).expect("one");
-        assert_eq!(names(&site, &[nearest]), ["wait-a"]);
-        assert_eq!(router.nearest(at(&site, "A"), []), None);
     }
 }

@@ -95,7 +95,7 @@ fn rules_of_the_planner_hear_every_rule_they_break() {
         ageing_permille: Some(10_001),
         lateness_permille: Some(10_001),
         hysteresis: Some(prost_types::Duration { seconds: 1, nanos: -1 }),
-        energy_ms_per_wh: Some(10_001),
+        energy_ms_per_wh: Some(5_001),
         ..v1::PlannerPolicy::default()
     };
     let fields = [

@@ -4,6 +4,7 @@
 
 use crate::energy::{RobotEnergy, Trip};
 use crate::fleet::projection::state::FleetProjection;
+use crate::fleet::traffic::routing;
 use crate::ids::WaypointId;
 use crate::reason::{Code, Reason};
 use crate::site::WaypointIx;
@@ -20,7 +21,7 @@ pub struct Demand<'a> {
     pub intake: &'a TaskIntake,
     /// Where its robot has to go; none: the map has lost a goal.
     goals: Option<Vec<WaypointIx>>,
-    /// The way to the first goal.
+    /// The way to the first goal around closed places.
     first: Option<Arc<DistanceField>>,
     /// Millimetres from each goal to the next; none: no way leads there.
     onward_mm: Option<Vec<u64>>,
@@ -38,8 +39,8 @@ impl<'a> Demand<'a> {
         Self {
             task,
             intake,
-            first: known.first().map(|goal| view.router.field(*goal)),
-            onward_mm: onward.map(|(at, goal)| view.router.distance_mm(*at, *goal)).collect(),
+            first: known.first().map(|goal| view.router.field_around(*goal, routing::closed(view))),
+            onward_mm: onward.map(|(at, goal)| routing::way_mm(view, *at, *goal)).collect(),
             home_mm: known.last().and_then(|last| home_mm(view, *last)),
             goals,
         }
@@ -89,5 +90,5 @@ impl<'a> Demand<'a> {
 
 /// Millimetres from a waypoint to the nearest charger.
 fn home_mm(view: &FleetProjection, from: WaypointIx) -> Option<u64> {
-    view.site.chargers().filter_map(|charger| view.router.distance_mm(from, charger)).min()
+    view.site.chargers().filter_map(|charger| routing::way_mm(view, from, charger)).min()
 }

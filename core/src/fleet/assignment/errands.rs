@@ -125,7 +125,7 @@ fn park_goal(view: &FleetProjection, coming: &Coming, robot_id: &RobotId, here: 
     (goal != here).then_some(goal)
 }
 
-/// The nearest of `goals` with room that no other errand is on its way to.
+/// The nearest of `goals` with room that no other errand is on its way to, and to which a way leads around closed places.
 fn free(
     view: &FleetProjection,
     coming: &Coming,
@@ -142,7 +142,11 @@ fn free(
             || (!routing::closed(view).contains(ix)
                 && starts::taken(view, ix, row, robot_id) + coming < row.capacity as usize)
     });
-    view.router.nearest(here, open).map(|(at, _)| at)
+    let reached = open.filter_map(|at| {
+        let around = view.router.field_around(at, routing::closed(view));
+        around.distance_mm(here).map(|way_mm| (way_mm, at))
+    });
+    reached.min().map(|(_, at)| at)
 }
 
 /// Begins an errand of a robot that nothing holds.

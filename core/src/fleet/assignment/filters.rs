@@ -19,9 +19,6 @@ use crate::site::WaypointIx;
 use crate::task::{AttemptPhase, Phase, TaskIntake, TaskState};
 use crate::time::Now;
 
-/// Charge that must be left at the charger, permille: an hour and a half of waiting on the way.
-pub const RESERVE_PERMILLE: u64 = 100;
-
 /// Whether the robot could be given work if nothing had it: nothing that lasts keeps it from work.
 pub fn in_work(view: &FleetProjection, board: &Board, robot_id: &RobotId, now: &Now) -> Result<(), Reason> {
     match liveness::presence(board, robot_id, now) {
@@ -113,7 +110,7 @@ pub(super) fn pair_if_able(
     let energy = view.energy_of(robot_id);
     let Some(trip) = demand.trip_home(view, energy, here, load.is_some())? else { return Ok(()) };
     let mandatory = u64::from(view.policy(&view.site.area_of(here).area_id).charge_mandatory_permille);
-    let needed = (trip.needed_permille() + RESERVE_PERMILLE).max(mandatory);
+    let needed = (trip.needed_permille() + limits::CHARGE_RESERVE_PERMILLE).max(mandatory);
     let has = u64::from(live.report.vitals.battery_permille);
     if has < needed {
         return Err(Reason::from(Code::BatteryLow).with("battery_permille", has).with("needed_permille", needed));

@@ -230,9 +230,9 @@ pub fn robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &RobotI
     Some(RobotExplanation { verdict, candidates, energy })
 }
 
-/// The reason, if it names a closed place that bars the way.
+/// The reason, if it names a closed or blocked place that bars the way.
 fn barring(why: Option<&Reason>) -> Option<&Reason> {
-    why.filter(|why| why.code == Code::PlaceOccupied && !why.message.is_empty())
+    why.filter(|why| matches!(why.code, Code::PlaceOccupied | Code::PlaceBlocked) && !why.message.is_empty())
 }
 
 /// The robot carries what is of no task that waits for it, its own item of one that waits for a person or for its next try, or what a person has

@@ -326,7 +326,7 @@ pub fn place_wait(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> 
                 let closure = names.iter().find_map(|id| closed_places::find_closed(view, &view.places.get(*id)?.row));
                 reason = closure.into_iter().fold(reason, |reason, closure| closure.word_reason(reason));
             } else if key == BLOCKED {
-                let block = wait.places.iter().find_map(|id| view.place_blocks.get(id.as_str()));
+                let block = names.iter().find_map(|id| view.place_blocks.get(*id));
                 reason = block.into_iter().fold(reason, |reason, block| blocked_places::word_block(reason, &block.row));
             }
         }
@@ -358,6 +358,8 @@ fn in_the_way(
     };
     let misses_a_seat = |p: &Place| !has_seat(p) && closed_places::find_closed(view, p).is_some();
     let is_shut = |p: &&Place| p.quarantine.is_some() || view.refused.is_place_aside(&p.place_id) || misses_a_seat(p);
+    let not_let_in = || rows().filter(|p| p.holder(robot_id).is_none());
+    let blocked = || not_let_in().filter_map(|p| view.place_blocks.get(p.place_id.as_str())).map(|block| &block.row);
     let holders = |seat: bool| -> BTreeSet<String> {
         names(&mut rows().filter(|p| has_seat(p) == seat).flat_map(|p| &p.holders).map(|h| &h.robot_id))
     };
@@ -370,7 +372,7 @@ fn in_the_way(
         (
             BLOCKED,
             "waits for a place that a person blocked",
-            places.iter().filter(|id| view.place_blocks.contains_key(id.as_str())).map(ToString::to_string).collect(),
+            blocked().map(|block| block.place_id.to_string()).collect(),
         ),
         ("held_by", "waits for a place that another robot holds", holders(false)),
         (

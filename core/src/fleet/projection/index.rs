@@ -186,7 +186,10 @@ impl Indexed<PlaceBlock> for FleetProjection {
 
 impl Indexed<Place> for FleetProjection {
     fn changed(view: &mut Self, id: &str, old: Option<&Place>) {
-        view.closed_places.take();
+        let is_shut = |place: Option<&Place>| place.is_some_and(|place| place.quarantine.is_some());
+        if is_shut(old) != is_shut(view.places.get(id).map(|place| &place.row)) {
+            view.closed_places.take();
+        }
         for robot in old.into_iter().flat_map(|p| &p.holders).map(|h| &h.robot_id) {
             view.dirty.insert(robot.clone());
             if let Some(places) = view.held_places.get_mut(robot) {

@@ -49,7 +49,11 @@ fn allocate(tx: &mut Tx, live: &NewestHeartbeat, releases: &mut Releases, occupa
         let free: Vec<PlaceIx> = free.collect();
         grants::grant_places(tx, robot_id, &free, occupancy);
     }
-    if grants::can_grant(tx.view, robot_id, &needed, occupancy) {
+    let can_grant = match is_whole {
+        true => grants::can_grant(tx.view, robot_id, &needed, occupancy),
+        false => grants::can_grant_again(tx.view, robot_id, &needed, occupancy),
+    };
+    if can_grant {
         grants::grant_places(tx, robot_id, &needed, occupancy);
         tx.view.waits.remove(robot_id);
         tx.view.dirty.insert(robot_id.clone());
@@ -58,8 +62,7 @@ fn allocate(tx: &mut Tx, live: &NewestHeartbeat, releases: &mut Releases, occupa
         }
         return;
     }
-    if is_whole && rerouting::reroute(tx, live, &a, &work, releases) {
-        tx.view.waits.remove(robot_id);
+    if is_whole && rerouting::reroute(tx, live, &a, &work, &needed, releases) {
         return;
     }
     let names = needed.iter().map(|p| tx.view.site.place(*p).place_id.clone()).collect();

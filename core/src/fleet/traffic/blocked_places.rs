@@ -16,7 +16,15 @@ use std::collections::BTreeSet;
 /// Places that nobody is let into now: those that are blocked, and those inside of a fleet stop.
 pub fn barred(view: &FleetProjection) -> BTreeSet<PlaceIx> {
     let blocked = view.place_blocks.values().filter_map(|block| view.site.find_place(&block.row.place_id));
-    blocked.chain(engaged_stops::closed(view)).collect()
+    let aside = view.unknown_rows.blocked_places().filter_map(|place_id| view.site.find_place(&place_id));
+    blocked.chain(aside).chain(engaged_stops::closed(view)).collect()
+}
+
+/// The only block that there is of a place of the map. None: there is none, or nobody can say which of several bars a way.
+pub fn find_only_block(view: &FleetProjection) -> Option<&PlaceBlock> {
+    let mut blocks = view.place_blocks.values().map(|block| &block.row);
+    let mut of_map = blocks.by_ref().filter(|block| view.site.find_place(&block.place_id).is_some());
+    of_map.next().filter(|_| of_map.next().is_none())
 }
 
 /// The block of a place that there is.
@@ -36,11 +44,16 @@ pub fn word_block(mut reason: Reason, block: &PlaceBlock) -> Reason {
     reason.with(WAITS_FOR, format!("the end of the block of place {place_id}"))
 }
 
-/// Ends the blocks whose time is over.
+/// Ends the blocks whose time is over, and those of places that the map has lost.
 pub(in crate::fleet) fn end_blocks(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
-    let is_over = |block: &PlaceBlock| block.until.is_some_and(|until| until <= now.utc);
+    let is_over = |block: &PlaceBlock| {
+        block.until.is_some_and(|until| until <= now.utc) || view.site.find_place(&block.place_id).is_none()
+    };
     let over = view.place_blocks.iter().filter(|(_, block)| is_over(&block.row)).map(|(id, _)| id.clone());
     for id in over.collect::<Vec<_>>() {
+        if plan.is_cut() {
+            return;
+        }
         plan.decide(view, now, "fleet", |tx| tx.delete::<PlaceBlock>(&id, "place.block_over"));
     }
 }

@@ -116,11 +116,14 @@ pub fn name_closed(view: &FleetProjection, reason: Reason) -> Reason {
     // A stop may bar the way as well: then nobody says which of them does.
     let is_alone = || engaged_stops::closed(view).is_empty();
     let on_the_way = || view.places.values().map(|place| &place.row).find(is_shut).filter(|_| is_alone());
-    let block =
-        || goal_block.or_else(|| view.place_blocks.values().next().map(|block| &block.row).filter(|_| is_alone()));
-    match goal.or_else(on_the_way).and_then(|place| find_closed(view, place)) {
-        Some(closure) => closure.word_reason(reason),
-        None => block().map_or(reason.clone(), |block| blocked_places::word_block(reason, block)),
+    let closure = goal.or_else(on_the_way).and_then(|place| find_closed(view, place));
+    let only_block = || blocked_places::find_only_block(view).filter(|_| is_alone());
+    match (goal_block, closure) {
+        (None, Some(closure)) => closure.word_reason(reason),
+        (block, _) => match block.or_else(only_block) {
+            Some(block) => blocked_places::word_block(reason, block),
+            None => reason,
+        },
     }
 }
 

@@ -3,7 +3,7 @@
 //! Invariant: a place has no more holders than seats, and an area admits one robot less than it has. Grants are traffic, never a safety function.
 
 use super::anchor::next_generation;
-use super::{blocked_places, starts};
+use super::{blocked_places, engaged_stops, starts};
 use crate::fleet::decision::plan::Tx;
 use crate::fleet::projection::rows::{HolderState, PlaceBlock, PlaceHolder};
 use crate::fleet::projection::state::FleetProjection;
@@ -18,15 +18,17 @@ const GRANTS_PER_GENERATION: u64 = 1024;
 /// What one round of grants knows beside the rows.
 #[derive(Default)]
 pub(super) struct Occupancy {
-    /// Places that an earlier request waits for, and those that nobody is let into.
+    /// Places that an earlier request waits for.
     blocked: BTreeSet<PlaceIx>,
+    /// Places that nobody is let into.
+    barred: BTreeSet<PlaceIx>,
     /// Robots that hold a standing place of an area, or start in one.
     inside: BTreeMap<AreaIx, BTreeSet<RobotId>>,
 }
 
 impl Occupancy {
     pub fn from_projection(view: &FleetProjection) -> Self {
-        let mut occupancy = Self { blocked: blocked_places::barred(view), ..Self::default() };
+        let mut occupancy = Self { barred: blocked_places::barred(view), ..Self::default() };
         let standing = view.site.places().iter().filter(|p| p.waypoint().is_some());
         for place in standing {
             let Some(row) = view.places.get(place.place_id.as_str()).map(|p| &p.row) else { continue };
@@ -66,8 +68,31 @@ pub fn robots_in_area(view: &FleetProjection, area: &AreaId) -> BTreeSet<RobotId
     view.held_places.iter().filter(|(_, ids)| ids.iter().any(|id| inside(id))).map(|(r, _)| r.clone()).collect()
 }
 
+/// Whether the robot holds the place, or may enter it.
+pub(super) fn holds(view: &FleetProjection, robot_id: &RobotId, place: PlaceIx) -> bool {
+    let row = view.places.get(view.site.place(place).place_id.as_str());
+    row.is_some_and(|place| place.row.holder(robot_id).is_some())
+}
+
 /// Whether the robot can have all of them now.
 pub(super) fn can_grant(view: &FleetProjection, robot_id: &RobotId, needed: &[PlaceIx], occupancy: &Occupancy) -> bool {
+    let is_open = |place: &PlaceIx| !occupancy.barred.contains(place) || holds(view, robot_id, *place);
+    needed.iter().all(is_open) && have_room(view, robot_id, needed, occupancy)
+}
+
+/// The same of places on a stretch that was released to it already: a block since then takes nothing back, a fleet stop does.
+pub(super) fn can_grant_again(
+    view: &FleetProjection,
+    robot_id: &RobotId,
+    needed: &[PlaceIx],
+    occupancy: &Occupancy,
+) -> bool {
+    let stopped = engaged_stops::closed(view);
+    let is_open = |place: &PlaceIx| !stopped.contains(place) || holds(view, robot_id, *place);
+    needed.iter().all(is_open) && have_room(view, robot_id, needed, occupancy)
+}
+
+fn have_room(view: &FleetProjection, robot_id: &RobotId, needed: &[PlaceIx], occupancy: &Occupancy) -> bool {
     let held = view.held_places.get(robot_id).map_or(0, BTreeSet::len);
     if held + needed.len() > limits::PLACES_OF_ROBOT_MAX {
         return false;
@@ -100,7 +125,8 @@ pub(super) fn kept_free(
         return Vec::new();
     }
     let (seats, passages): (Vec<_>, Vec<_>) = needed.iter().partition(|ix| place(ix).waypoint().is_some());
-    let is_free = |ix: &PlaceIx| has_seat(view, robot_id, *ix) && !occupancy.blocked.contains(ix);
+    let is_barred = |ix: &PlaceIx| occupancy.blocked.contains(ix) || occupancy.barred.contains(ix);
+    let is_free = |ix: &PlaceIx| has_seat(view, robot_id, *ix) && !is_barred(ix);
     if seats.iter().all(is_free) { [seats, passages].concat() } else { seats }
 }
 

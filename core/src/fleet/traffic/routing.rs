@@ -89,7 +89,13 @@ pub fn indices(site: &Site, route: &[RoutePoint]) -> Option<Vec<WaypointIx>> {
 /// Millimetres to each of the goals from the one before it, in order.
 pub fn legs_mm(view: &FleetProjection, start: WaypointIx, goals: &[WaypointIx]) -> Option<Vec<u64>> {
     let starts = std::iter::once(&start).chain(goals);
-    starts.zip(goals).map(|(at, goal)| view.router.distance_mm(*at, *goal)).collect()
+    starts.zip(goals).map(|(at, goal)| way_mm(view, *at, *goal)).collect()
+}
+
+/// Millimetres from one waypoint to another around closed places; through them, if no way leads around: they open again.
+pub fn way_mm(view: &FleetProjection, from: WaypointIx, to: WaypointIx) -> Option<u64> {
+    let around = view.router.field_around(to, closed(view)).distance_mm(from);
+    around.or_else(|| view.router.distance_mm(from, to))
 }
 
 /// Index of a waypoint by name.

@@ -23,7 +23,7 @@ fn slots(view: &FleetProjection) -> BTreeMap<&'static str, Vec<String>> {
         ($($slot:ident)*) => { BTreeMap::from([$((stringify!($slot), view.$slot.iter().map(|r| format!("{r:?}")).collect())),*]) };
     }
     told!(intakes tasks ended dependants attempts timers holds places authority control counters sites policies planner_policies
-        desired_work desired_policy clocks marks incidents sessions lane_marks held_places energy)
+        desired_work desired_policy clocks marks incidents sessions lane_marks held_places energy place_blocks)
 }
 
 fn without_empty(mut slots: BTreeMap<&'static str, Vec<String>>) -> BTreeMap<&'static str, Vec<String>> {
