@@ -158,3 +158,16 @@ async fn everything_that_is_wrong_with_a_block_is_told_at_once_and_nothing_is_ke
     w.fleet.block_place(local(checked)).await.expect("it would do");
     assert!(w.seen().await.all::<PlaceBlock>().is_empty());
 }
+
+#[tokio::test(start_paused = true)]
+async fn nobody_is_sent_to_a_charger_that_only_a_blocked_way_reaches() {
+    let mut w = World::on(CORRIDOR).await;
+    w.robot("r1", "park-a").await;
+    block(&w, "corridor", None).await;
+    w.r("r1").battery_permille = 150;
+    w.pass_while(20, "it stays where it is", |s| s.errand("r1").is_none()).await;
+    unblock(&w, "corridor").await.expect("opened");
+    let seen = w.until("it goes to charge", |s| s.errand("r1").is_some()).await;
+    assert_eq!(seen.errand("r1").map(|(_, goal)| goal), Some("charge".to_owned()));
+    w.lawful().await;
+}
