@@ -123,6 +123,7 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0101_no_timer_by_ord",
     "0102_no_task_request_by_parent",
     "0103_planner_policy",
+    "0104_task_type",
 ];
 
 /// Of `telemetry.db`.
