@@ -31,7 +31,8 @@ pub fn misspelled<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> impl 
 fn is_slip(name: &str, known: &str) -> bool {
     let digits = |text: &str| text.bytes().filter(u8::is_ascii_digit).collect::<Vec<_>>();
     let words = |text: &str| text.split(['-', '_']).count();
-    let letters = name.len().min(known.len());
+    let letters_of = |text: &str| text.bytes().filter(u8::is_ascii_alphabetic).count();
+    let letters = letters_of(name).min(letters_of(known));
     if letters < SLIP_LETTERS || digits(name) != digits(known) || words(name) != words(known) {
         return false;
     }

@@ -38,18 +38,22 @@ pub fn parse_task_type(
     (bad.0.len() == before).then_some(of)
 }
 
-fn parse_field(wire: v1::TaskTypeField, at: At<'_>, bad: &mut Violations) -> Option<TypeField> {
+/// Which values a field takes. None: its kind is missing, or of a newer version.
+pub fn kind_of(field: &v1::TaskTypeField) -> Option<FieldKind> {
     use v1::task_type_field::Kind;
-    let kind = match wire.kind {
-        Some(Kind::Waypoint(v1::WaypointKind {})) => FieldKind::Waypoint,
-        Some(Kind::Integer(v1::IntegerKind { least, most, unit })) => FieldKind::Integer { least, most, unit },
-        Some(Kind::Number(v1::NumberKind { least, most, unit })) => FieldKind::Number { least, most, unit },
-        Some(Kind::Text(v1::TextKind { max_bytes })) => FieldKind::Text { max_bytes },
-        Some(Kind::Choice(v1::ChoiceKind { choices })) => FieldKind::Choice { choices },
-        None => {
-            bad.add(at.to_string(), "must be one of waypoint, integer, number, text, choice");
-            return None;
-        }
+    Some(match field.kind.clone()? {
+        Kind::Waypoint(v1::WaypointKind {}) => FieldKind::Waypoint,
+        Kind::Integer(v1::IntegerKind { least, most, unit }) => FieldKind::Integer { least, most, unit },
+        Kind::Number(v1::NumberKind { least, most, unit }) => FieldKind::Number { least, most, unit },
+        Kind::Text(v1::TextKind { max_bytes }) => FieldKind::Text { max_bytes },
+        Kind::Choice(v1::ChoiceKind { choices }) => FieldKind::Choice { choices },
+    })
+}
+
+fn parse_field(wire: v1::TaskTypeField, at: At<'_>, bad: &mut Violations) -> Option<TypeField> {
+    let Some(kind) = kind_of(&wire) else {
+        bad.add(at.to_string(), "must be one of waypoint, integer, number, text, choice");
+        return None;
     };
     let default = match wire.default {
         Some(value) => Some(common::from_value(value, at.field("default"), bad)?),
