@@ -3,7 +3,7 @@
 use super::{At, WireEnum, from_struct, maybe_id, parse_ms, parse_time};
 use crate::task::v1;
 use midshift_core::ids::{RequestId, TaskId, WaypointId};
-use midshift_core::reason::{Refusal, Violation, Violations};
+use midshift_core::reason::{Refusal, Violations};
 use midshift_core::rows::Revision;
 use midshift_core::step::Effect;
 use midshift_core::task::forms::Transport;
@@ -86,7 +86,6 @@ impl Submission {
     /// Each broken rule, or the type that it names is of a newer version.
     pub fn check(self, knows: &dyn Fn(&WaypointId) -> bool, types: &TypeCatalogue) -> Result<CheckedTask, Refusal> {
         let Self { task, form, mut bad, .. } = self;
-        let unread = bad.0.len();
         let (raw, type_revision) = match form {
             Form::Missing => {
                 bad.add("body", "is required: one of spec, flat, nested, typed");
@@ -102,16 +101,21 @@ impl Submission {
                 (task.task, None)
             }
         };
-        let (has_from, kept) = (raw.steps.len() > 1, if form == Form::Spec { unread } else { bad.0.len() });
+        let (has_from, has_steps, kept) = (raw.steps.len() > 1, !raw.steps.is_empty(), bad.0.len());
         let checked = raw.check("spec", knows);
         if let Err(refusal) = &checked {
             for violation in &refusal.violations {
-                let field = form.name_of(violation.field.strip_prefix("spec.").unwrap_or(&violation.field), has_from);
-                // Said once: what cannot be read, fields of which no steps were made, and a parameter of both legs of a
-                // short form.
+                let name = violation.field.strip_prefix("spec.").unwrap_or(&violation.field);
+                // What its type or its fields would have said, which are told of already.
+                let is_of_type =
+                    name.starts_with("steps") && !has_steps || name == "timeout" && type_revision.is_none();
+                if form == Form::Typed && is_of_type {
+                    continue;
+                }
+                let field = form.name_of(name, has_from);
+                // Said once: what cannot be read, and a parameter of both legs of a short form.
                 let said = if form == Form::Spec { kept } else { bad.0.len() };
-                let is_said = |v: &Violation| v.field == field || form == Form::Typed && v.field.starts_with(&field);
-                if !bad.0[..said].iter().any(is_said) {
+                if !bad.0[..said].iter().any(|v| v.field == field) {
                     bad.add(field, violation.description.clone());
                 }
             }

@@ -130,7 +130,8 @@ async fn a_slip_of_a_known_type_is_refused_with_what_was_meant_until_a_site_call
 
 #[tokio::test]
 async fn a_site_that_takes_known_types_alone_refuses_every_other_and_of_a_batch_only_that() {
-    let service = World::new().await.service;
+    let world = World::new().await;
+    let service = world.service.clone();
     put(&service, shelf_scan()).await.expect("registered");
     accept_known_only(&service, true).await;
     assert!(list(&service).await.rules.expect("always set").known_only);
@@ -138,8 +139,8 @@ async fn a_site_that_takes_known_types_alone_refuses_every_other_and_of_a_batch_
     let item = |(n, request)| SubmitTaskRequest { request_id: format!("r{n}"), ..request };
     let items = requests.into_iter().enumerate().map(item);
     let items = items.map(|item| v1::SubmitTasksRequest { item: Some(item) });
-    let mut client = World::client(&World { service: service.clone(), ..World::new().await });
-    let results = client.submit_tasks(tokio_stream::iter(items)).await.expect("a batch").into_inner().results;
+    let stream = local(tokio_stream::iter(items));
+    let results = world.client().submit_tasks(stream).await.expect("a batch").into_inner().results;
     let taken: Vec<bool> = results.iter().map(|r| matches!(r.outcome, Some(Outcome::TaskId(_)))).collect();
     assert_eq!(taken, [false, true, true]);
     accept_known_only(&service, false).await;
@@ -161,7 +162,8 @@ async fn a_type_changes_over_the_etag_that_was_seen_and_a_deleted_name_never_rep
     delete(&service, "shelf-scan", "").await.expect("it is so already");
     assert!(list(&service).await.types.is_empty());
     let unknown = submit(&service, typed("r1", json!({}))).await.expect_err("no type");
-    assert_eq!(told(&unknown)[0].0, "typed.type");
+    let none = "the site has no type registered; `midshift task type put FILE` registers one";
+    assert_eq!(told(&unknown), [("typed.type".to_owned(), none.to_owned())], "and nothing of what it would have said");
     let again = put(&service, shelf_scan()).await.expect("registered anew");
     let number = |etag: &str| etag.parse::<u64>().expect("a number");
     assert!(number(&again.etag) > number(&second.etag), "revisions of a name go on");
@@ -197,7 +199,8 @@ async fn a_type_that_breaks_rules_hears_them_all_and_a_check_stores_nothing() {
     assert!(list(&service).await.types.is_empty());
     let mut broken = shelf_scan();
     broken.name = "Shelf".into();
-    broken.fields[1].default = from_json(json!(2001)).ok();
+    let over = prost_types::value::Kind::NumberValue(2_001.0);
+    broken.fields[1].default = Some(prost_types::Value { kind: Some(over) });
     broken.steps.remove(1);
     let status = put(&service, broken).await.expect_err("three rules are broken");
     let fields: Vec<String> = told(&status).into_iter().map(|(field, _)| field).collect();
