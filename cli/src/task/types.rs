@@ -79,15 +79,20 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
         Verb::Put { call, file, dry_run } => put(&call, &file, dry_run, out).await,
         Verb::Delete { call, name, if_match, dry_run } => {
             let request = v1::DeleteTaskTypeRequest { name: name.clone(), etag: if_match, validate_only: dry_run };
-            call.task().await?.delete_task_type(unary(request)).await?;
-            out.inform(&if dry_run { "valid; nothing was deleted".to_owned() } else { format!("{name} is deleted") });
+            let answer = call.task().await?.delete_task_type(unary(request)).await?.into_inner();
+            let end = if dry_run { "may be deleted; nothing was" } else { "is deleted" };
+            out.one(&answer, &name, || format!("{name} {end}"))?;
             Ok(())
         }
         Verb::Accept { call, which, dry_run } => {
             let rules = v1::TaskTypeRules { known_only: which == Accepted::Known, ..v1::TaskTypeRules::default() };
-            let request = v1::PutTaskTypeRulesRequest { rules: Some(rules.clone()), validate_only: dry_run };
-            call.task().await?.put_task_type_rules(unary(request)).await?;
-            out.inform(if dry_run { "valid; nothing was stored" } else { says(&rules) });
+            let request = v1::PutTaskTypeRulesRequest { rules: Some(rules), validate_only: dry_run };
+            let answer = call.task().await?.put_task_type_rules(unary(request)).await?.into_inner();
+            let rules = answer.rules.unwrap_or_default();
+            out.one(&rules, if rules.known_only { "known" } else { "any" }, || says(&rules).to_owned())?;
+            if dry_run {
+                out.inform("valid; nothing was stored");
+            }
             Ok(())
         }
     }
@@ -188,7 +193,8 @@ fn describe(of: &v1::TaskType) -> String {
     let mut text = format!("{}{}\n  {}\n", of.name, timeout.unwrap_or_default(), plain(&of.description));
     let rows: Vec<Vec<String>> = of.fields.iter().map(row).collect();
     if !rows.is_empty() {
-        text += &columns(&["FIELD", "MUST BE", "WITHOUT IT", "WHAT"], &rows);
+        text += columns(&["FIELD", "MUST BE", "WITHOUT IT", "WHAT"], &rows).trim_end();
+        text += "\n";
     }
     let steps: Vec<String> = of.steps.iter().map(step).collect();
     text + "steps: " + &plain(&steps.join(", ")) + "\n"

@@ -31,7 +31,9 @@ impl TypeCommand {
                 .about("task_type", &of.name)
                 .with("type", TaskTypeRow::Type(of.clone()).body()),
             Self::Delete(name) => Note::new("task_type.delete").about("task_type", name),
-            Self::PutRules(rules) => Note::new("task_type.put_rules").with("known_only", rules.known_only),
+            Self::PutRules(rules) => {
+                Note::new("task_type.put_rules").about("task_type", RULES_ID).with("known_only", rules.known_only)
+            }
         }
     }
 
@@ -136,7 +138,10 @@ fn delete(
         let reason = match meant.as_slice() {
             _ if is_built_in(name) => Reason::new(Code::TaskTypeNotFound, format!("{name} is built in and stays.")),
             [] => reason,
-            meant => reason.with("did_you_mean", meant.join(" or ")),
+            meant => {
+                let text = format!("The site has no such task type registered; did you mean {}?", meant.join(" or "));
+                Reason::new(Code::TaskTypeNotFound, text).with("type", super::definition::shown(name))
+            }
         };
         return Err(Refusal::new(Kind::NotFound, reason));
     };

@@ -49,7 +49,7 @@ fn read_fields(
     let read = |field: &TypeField, bad: &mut Violations| {
         let value = match sent.get(&field.name).or(field.default.as_ref()) {
             Some(value) => field.kind.read(value, knows),
-            None => Err(format!("is required: must be {}", field.kind)),
+            None => Err(format!("is required, {}", field.kind)),
         };
         let value = bad.accept(&format!("{at}.{}", field.name), value)?;
         Some((field.name.clone(), value))
@@ -129,7 +129,7 @@ mod tests {
             ("hieght_mm", "shelf-scan has no such field; did you mean height_mm?"),
             ("shelf", "the site has no waypoint A99"),
             ("zoom", "must be a number, 1..4"),
-            ("side", "is required: must be one of left, right"),
+            ("side", "is required, one of left, right"),
             ("settle_s", "must be a whole number, 1..60 s"),
         ];
         assert_eq!(bad, wanted.map(|(field, text)| (format!("typed.fields.{field}"), text.to_owned())));
