@@ -76,7 +76,7 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
         Verb::Ls { call } => list(&call, out).await,
         Verb::Get { call, name } => get(&call, &name, out).await,
-        Verb::Put { call, file, dry_run } => put(&call, &file, dry_run, out).await,
+        Verb::Put { call, file, dry_run } => put_file(&call, &file, dry_run, out).await,
         Verb::Delete { call, name, if_match, dry_run } => {
             let request = v1::DeleteTaskTypeRequest { name: name.clone(), etag: if_match, validate_only: dry_run };
             let answer = call.task().await?.delete_task_type(unary(request)).await?.into_inner();
@@ -144,7 +144,7 @@ async fn get(call: &Call, name: &str, out: &Out) -> Result<(), Exit> {
     Err(Exit::new(4, text).or_try("midshift task type ls"))
 }
 
-async fn put(call: &Call, file: &Path, dry_run: bool, out: &Out) -> Result<(), Exit> {
+async fn put_file(call: &Call, file: &Path, dry_run: bool, out: &Out) -> Result<(), Exit> {
     let of = read_file(file)?;
     let name = of.name.clone();
     let request = v1::PutTaskTypeRequest { r#type: Some(of), validate_only: dry_run };

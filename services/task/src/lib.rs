@@ -9,6 +9,7 @@ mod batch;
 mod commands;
 mod filtered_commands;
 mod grpc;
+mod known_types;
 mod list;
 mod prune;
 mod resume;
@@ -19,6 +20,7 @@ mod types;
 mod watch;
 mod watch_state;
 
+use known_types::KnownTypes;
 use midshift_core::Boxed;
 use midshift_core::item::Item;
 use midshift_core::limits;
@@ -36,7 +38,6 @@ use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding;
 use tonic::service::Routes;
-use types::KnownTypes;
 
 /// What the service is built from.
 pub struct Parts {

@@ -6,12 +6,13 @@
 use crate::TaskService;
 use crate::admit::no_result;
 use crate::commands::internal;
+use crate::known_types::KnownTypes;
 use crate::rows::unavailable;
 use midshift_core::identity::{Caller, Permission};
 use midshift_core::item::Item;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal, Violations};
-use midshift_core::rows::{Revision, Seq, Table, Writer};
+use midshift_core::rows::{Revision, Table, Writer};
 use midshift_core::task::types::definition::TypeRules;
 use midshift_core::task::types::{TypeCatalogue, TypeCommand};
 use midshift_proto::convert::At;
@@ -23,12 +24,6 @@ use std::sync::{Arc, MutexGuard, PoisonError};
 
 /// Times that a change is decided anew because its row moved meanwhile, before the caller is told.
 const TRIES: usize = 4;
-
-/// Task types of the site, as they were when this was the newest commit.
-pub(crate) struct KnownTypes {
-    head: Seq,
-    types: Arc<TypeCatalogue>,
-}
 
 impl TaskService {
     /// The task types of the site as they are now.

@@ -61,8 +61,8 @@ impl TypeCommand {
             return Err(Refusal::new(Kind::Precondition, reason.clone()));
         }
         match self {
-            Self::Put(of) => put(of, item, types, seen, now),
-            Self::Delete(name) => delete(name, item, types, seen, now),
+            Self::Put(of) => put_type(of, item, types, seen, now),
+            Self::Delete(name) => delete_type(name, item, types, seen, now),
             Self::PutRules(rules) => {
                 let known = types.rules();
                 if known.map(|(known, _)| known).unwrap_or_default() != *rules {
@@ -86,7 +86,7 @@ fn check_seen(seen: Option<Revision>, current: Option<Revision>) -> Result<(), R
     }
 }
 
-fn put(
+fn put_type(
     of: &TaskType,
     item: &mut Item,
     types: &TypeCatalogue,
@@ -121,7 +121,7 @@ fn oldest_past<'a>(types: &'a TypeCatalogue, now: &Now) -> Option<(&'a str, Revi
     is_past.then_some((name, *revision))
 }
 
-fn delete(
+fn delete_type(
     name: &str,
     item: &mut Item,
     types: &TypeCatalogue,
@@ -170,7 +170,7 @@ mod tests {
         Ok(item.rows.into_iter().map(change).collect())
     }
 
-    fn of(name: &str) -> TaskType {
+    fn make_type(name: &str) -> TaskType {
         TaskType { name: name.to_owned(), ..shelf_scan() }
     }
     fn deleted(name: &str, at_unix_ms: i64) -> TaskTypeRow {
@@ -179,8 +179,8 @@ mod tests {
 
     #[test]
     fn a_type_is_put_over_the_revision_that_was_seen_and_changes_nothing_when_it_is_there() {
-        let (put, changed) = (TypeCommand::Put(of("scan")), TaskType { timeout_ms: None, ..of("scan") });
-        let there = [row(&TaskTypeRow::Type(of("scan")), 3)];
+        let (put, changed) = (TypeCommand::Put(make_type("scan")), TaskType { timeout_ms: None, ..of("scan") });
+        let there = [row(&TaskTypeRow::Type(make_type("scan")), 3)];
         let at = |expect| Ok(vec![("scan".to_owned(), expect, false)]);
         assert_eq!(decided(&put, &[], None), at(Expect::Absent));
         assert_eq!(decided(&put, &[], Some(1)), Err(Code::EtagMismatch));
@@ -196,7 +196,7 @@ mod tests {
     #[test]
     fn a_type_is_deleted_once_and_its_name_stays() {
         let delete = TypeCommand::Delete("scan".into());
-        let there = [row(&TaskTypeRow::Type(of("scan")), 3)];
+        let there = [row(&TaskTypeRow::Type(make_type("scan")), 3)];
         assert_eq!(decided(&delete, &there, Some(2)), Err(Code::EtagMismatch));
         assert_eq!(decided(&delete, &there, None), Ok(vec![("scan".to_owned(), Expect::At(Revision(3)), false)]));
         assert_eq!(decided(&delete, &[row(&deleted("scan", NOW), 4)], None), Ok(vec![]));
@@ -217,8 +217,8 @@ mod tests {
 
     #[test]
     fn there_are_so_many_types_at_once_and_so_many_names() {
-        let put = TypeCommand::Put(of("scan"));
-        let types = (0..limits::TASK_TYPES_MAX).map(|n| row(&TaskTypeRow::Type(of(&format!("t{n}"))), 1));
+        let put = TypeCommand::Put(make_type("scan"));
+        let types = (0..limits::TASK_TYPES_MAX).map(|n| row(&TaskTypeRow::Type(make_type(&format!("t{n}"))), 1));
         let types: Vec<Row> = types.collect();
         assert_eq!(decided(&put, &types, None), Err(Code::TaskTypesFull));
         assert!(decided(&TypeCommand::Put(TaskType { timeout_ms: None, ..of("t0") }), &types, None).is_ok());

@@ -57,7 +57,7 @@ pub enum TemplateKind {
         /// Which field each parameter takes its value from.
         params: BTreeMap<String, String>,
     },
-    /// Stand.
+    /// Stand where the robot is.
     Wait {
         /// The field that says how long: a whole number with the unit `s` or `ms`.
         field: String,

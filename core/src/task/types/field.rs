@@ -49,7 +49,7 @@ pub enum FieldKind {
         /// As people write it, such as `kg`. Empty: a plain number.
         unit: String,
     },
-    /// Text.
+    /// Text of some length.
     Text {
         /// At most so many bytes.
         max_bytes: u32,
