@@ -4,12 +4,13 @@ use prost_reflect::{DescriptorPool, FieldDescriptor, MessageDescriptor, MethodDe
 use std::fmt::Write;
 use std::path::PathBuf;
 
-const FILES: [&str; 23] = [
+const FILES: [&str; 24] = [
     "midshift/common/v1/access.proto",
     "midshift/common/v1/common.proto",
     "midshift/common/v1/privacy.proto",
     "midshift/task/v1/task.proto",
     "midshift/task/v1/task_service.proto",
+    "midshift/task/v1/task_type.proto",
     "midshift/fleet/v1/fleet.proto",
     "midshift/fleet/v1/fleet_service.proto",
     "midshift/fleet/v1/planner.proto",

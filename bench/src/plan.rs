@@ -276,6 +276,7 @@ fn add_tasks(view: &mut FleetProjection, kind: Fleet, robots: usize, seed: u64, 
             payload_hash: String::new(),
             created: now.utc,
             number: i as u64 + 1,
+            type_revision: None,
         };
         let state = TaskState::born(&intake);
         absorb(view, &intake);

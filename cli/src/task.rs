@@ -7,6 +7,7 @@ mod resume;
 mod shown;
 mod submit;
 mod target;
+mod types;
 
 pub use resume::Resume;
 
@@ -29,8 +30,11 @@ const TOLD_EVERY: u64 = 100_000;
 /// Verbs of tasks.
 #[derive(Subcommand)]
 pub enum Verb {
-    /// Submit a transport, or a whole list.
+    /// Submit a transport, a task of a registered type, or a whole list.
     Submit(Box<Submit>),
+    /// Task types of the site: look at, register, delete.
+    #[command(subcommand)]
+    Type(types::Verb),
     /// List tasks, newest first.
     Ls(List),
     /// Show one task with its attempts.
@@ -113,6 +117,7 @@ pub struct List {
 pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
     match verb {
         Verb::Submit(args) => submit::run(*args, out).await,
+        Verb::Type(verb) => types::run(verb, out).await,
         Verb::Ls(args) => list(args, out).await,
         Verb::Get(one) => get(&one, out).await,
         Verb::Watch { call, ids, cursor } => watch(&call, ids, cursor, out).await,

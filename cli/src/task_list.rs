@@ -41,12 +41,14 @@ pub fn read_list(path: &Path, site: &Site) -> anyhow::Result<Vec<SubmitTaskReque
         .collect()
 }
 
-/// One JSON object of a list: either short form of a transport, by its fields.
+/// One JSON object of a list: which form it is, is told by its fields.
 fn json_request(task: serde_json::Value) -> anyhow::Result<SubmitTaskRequest> {
     let body = if task.get("content").is_some() {
         Body::Nested(midshift_proto::json::from_json(task)?)
     } else if task.get("steps").is_some() {
         Body::Spec(midshift_proto::json::from_json(task)?)
+    } else if task.get("fields").is_some() {
+        Body::Typed(midshift_proto::json::from_json(task)?)
     } else {
         Body::Flat(midshift_proto::json::from_json(task)?)
     };

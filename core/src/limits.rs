@@ -97,6 +97,22 @@ pub const ROBOTS_ASKED_PER_TURN: usize = 4_096;
 pub const REQUESTS_PER_TURN: usize = 64;
 /// Steps of one task.
 pub const STEPS_MAX: usize = 64;
+/// Task types that a site has registered at once: more than anybody tells apart, and a list that is one message.
+pub const TASK_TYPES_MAX: usize = 64;
+/// Names of task types that a site keeps, also of deleted ones: fits one page of a list. Two processes at once may pass it by one.
+pub const TASK_TYPE_NAMES_MAX: usize = 256;
+/// One task type as JSON, bytes: all of them are 1 MiB.
+pub const TASK_TYPE_BYTES_MAX: usize = 16 * 1024;
+/// Fields of one task type.
+pub const TYPE_FIELDS_MAX: usize = 32;
+/// Choices of one field of a task type.
+pub const TYPE_CHOICES_MAX: usize = 32;
+/// Text that one field of a task type takes, bytes: 8 of the longest fit the parameters of one action.
+pub const TYPE_TEXT_BYTES_MAX: u32 = 1_024;
+/// A unit of a field of a task type, bytes.
+pub const TYPE_UNIT_BYTES_MAX: usize = 16;
+/// Whole numbers of a field of a task type, either side of zero: beyond, a number on the wire is not exact.
+pub const TYPE_INTEGER_MAX: i64 = 1 << 53;
 /// Labels of one task or robot.
 pub const LABELS_MAX: usize = 32;
 /// Dependencies of one task.

@@ -15,6 +15,37 @@ pub fn nearest<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> impl Ite
     std::iter::from_fn(move || nearest.pop().map(|Reverse((_, known))| known)).take(NAMES_MAX)
 }
 
+/// Letters of the shortest name of which a slip can be told from another name.
+const SLIP_LETTERS: usize = 5;
+/// Letters from which on two slips are told too.
+const TWO_SLIPS_LETTERS: usize = 8;
+
+/// The known names of which `name` is likely a slip of the hand, nearest first, at most 3: one letter more, less or
+/// another, two where names are long, or two neighbours that changed places. Numbers and words that are set apart are no
+/// slip: `line-2` is not `line-1`, and `transport-b` is not `transport`.
+pub fn misspelled<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> impl Iterator<Item = &'a str> {
+    let slips = |known: &&'a str| is_slip(name, known);
+    nearest(name, known.filter(slips).collect::<Vec<_>>().into_iter())
+}
+
+fn is_slip(name: &str, known: &str) -> bool {
+    let digits = |text: &str| text.bytes().filter(u8::is_ascii_digit).collect::<Vec<_>>();
+    let words = |text: &str| text.split(['-', '_']).count();
+    let letters_of = |text: &str| text.bytes().filter(u8::is_ascii_alphabetic).count();
+    let letters = letters_of(name).min(letters_of(known));
+    if letters < SLIP_LETTERS || digits(name) != digits(known) || words(name) != words(known) {
+        return false;
+    }
+    let slips = if letters < TWO_SLIPS_LETTERS { 1 } else { 2 };
+    has_neighbours_swapped(name.as_bytes(), known.as_bytes())
+        || edits(name.as_bytes(), known.as_bytes()).is_some_and(|edits| edits <= slips)
+}
+
+fn has_neighbours_swapped(a: &[u8], b: &[u8]) -> bool {
+    let Some(at) = a.iter().zip(b).position(|(x, y)| x != y) else { return false };
+    a.len() == b.len() && at + 1 < a.len() && a[at] == b[at + 1] && a[at + 1] == b[at] && a[at + 2..] == b[at + 2..]
+}
+
 /// How many bytes are put in, left out or changed between two names; none: more than [`EDITS_MAX`].
 fn edits(a: &[u8], b: &[u8]) -> Option<usize> {
     if a.len().abs_diff(b.len()) > EDITS_MAX {
@@ -37,7 +68,7 @@ fn edits(a: &[u8], b: &[u8]) -> Option<usize> {
 
 #[cfg(test)]
 mod tests {
-    use super::nearest;
+    use super::{misspelled, nearest};
 
     #[test]
     fn the_names_that_may_be_meant_come_nearest_first_and_strangers_not_at_all() {
@@ -47,5 +78,37 @@ mod tests {
         assert_eq!(found("rbt-004"), ["rbt-04", "rbt-14", "rbt-40"]);
         assert_eq!(found("forklift7"), ["forklift-7"]);
         assert!(found("crane").is_empty() && found("").is_empty());
+    }
+
+    #[test]
+    fn a_slip_of_the_hand_is_told_from_another_name() {
+        let known = ["inspect", "line-1", "patrol", "pick", "pick-place", "transport"];
+        let found = |name| misspelled(name, known.into_iter()).collect::<Vec<_>>();
+        for (slip, meant) in [
+            ("transpot", "transport"),
+            ("transprot", "transport"),
+            ("transports", "transport"),
+            ("partol", "patrol"),
+            ("patrl", "patrol"),
+            ("inspekt", "inspect"),
+            ("pick_place", "pick-place"),
+        ] {
+            assert_eq!(found(slip), [meant], "{slip}");
+        }
+        for other in [
+            "pack",
+            "picks",
+            "trnsprt",
+            "lick",
+            "line-2",
+            "line-1b",
+            "transport-b",
+            "transport2",
+            "transfer",
+            "visit",
+            "",
+        ] {
+            assert!(found(other).is_empty(), "{other}: {:?}", found(other));
+        }
     }
 }

@@ -171,6 +171,7 @@ retention_rules! {
     Place::Table(Table::TaskIntake) => [Operations, Person] Operate Month;
     Place::Table(Table::TaskRequest) => [Operations, Person] Operate Month;
     Place::Table(Table::RequestKey) => [Operations] Operate Week;
+    Place::Table(Table::TaskType) => [Site] Operate Standing;
     Place::Table(Table::TaskState) => [Operations, Person] Operate Month;
     Place::Table(Table::Attempt) => [Operations, Machine, Software] Diagnose Month;
     Place::Table(Table::Timer) => [Operations] Operate Standing;

@@ -63,6 +63,7 @@ tables! {
     TaskIntake "task_intake" Task, "What was asked for: immutable. id = task_id, order = admission number.";
     TaskRequest "task_request" Task, "What people ask of a task or robot afterwards (cancel, resolve, edit, hold, release, resume): append-only, kept 30 days.";
     RequestKey "request_key" Task, "request_id -> payload hash and answer; kept 7 days.";
+    TaskType "task_type" Task, "A task type of the site, that one was deleted, or whether only known types are taken. id = its name; * for the last.";
     TaskState "task_state" Fleet, "Where a task is. Born QUEUED with its intake. state = phase.";
     Attempt "attempt" Fleet, "One grant of a task or errand to one robot. id = subject/epoch, parent = subject.";
     Timer "timer" Fleet, "A deadline in serving time. id = kind and attempt.";

@@ -372,6 +372,7 @@ fn intake(number: u64, ended: Utc, spec: &TaskSpec) -> TaskIntake {
         payload_hash: String::new(),
         created: Utc(ended.0 - 120_000),
         number,
+        type_revision: None,
     }
 }
 

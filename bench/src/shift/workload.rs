@@ -127,6 +127,6 @@ fn priority_mut(request: &mut SubmitTaskRequest) -> Option<&mut Option<i32>> {
     match &mut request.body {
         Some(Body::Flat(flat)) => Some(&mut flat.priority),
         Some(Body::Spec(spec)) => Some(&mut spec.priority),
-        Some(Body::Nested(_)) | None => None,
+        Some(Body::Nested(_) | Body::Typed(_)) | None => None,
     }
 }

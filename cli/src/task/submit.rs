@@ -1,4 +1,4 @@
-//! `midshift task submit`: a transport, or a whole list.
+//! `midshift task submit`: a transport, a task by type and fields, or a whole list.
 
 use super::follow::{report_state, until_over};
 use super::shown::show;
@@ -15,6 +15,9 @@ use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::time::Duration;
 
+/// How long one attempt of a transport may take where nothing is said.
+const TIMEOUT: Duration = Duration::from_secs(600);
+
 /// What to submit.
 #[derive(clap::Args)]
 pub struct Submit {
@@ -24,8 +27,14 @@ pub struct Submit {
     #[arg(long, default_value = "")]
     from: String,
     /// Waypoint to bring it to.
-    #[arg(long, required_unless_present = "file")]
+    #[arg(long, required_unless_present_any = ["file", "type"])]
     to: Option<String>,
+    /// A task of this registered type instead (`midshift task type ls`): its steps are made of its fields.
+    #[arg(long, value_name = "TYPE", conflicts_with_all = ["from", "to", "sku"])]
+    r#type: Option<String>,
+    /// A field of the type, as often as needed.
+    #[arg(long, value_name = "NAME=VALUE", requires = "type", value_parser = field_value)]
+    field: Vec<(String, String)>,
     /// The item.
     #[arg(long, default_value = "")]
     sku: String,
@@ -44,9 +53,9 @@ pub struct Submit {
     /// Also if nobody knows a robot that a task names: it waits until that robot comes.
     #[arg(long)]
     unknown_robot: bool,
-    /// How long one attempt may take.
-    #[arg(long, value_parser = crate::duration, default_value = "10m")]
-    timeout: Duration,
+    /// How long one attempt may take. Without it 10m, or what the type says.
+    #[arg(long, value_parser = crate::duration)]
+    timeout: Option<Duration>,
     /// How long it may be ready before a robot starts; then a person is asked. Without it as long as it takes.
     #[arg(long, value_parser = crate::duration)]
     schedule_to_start: Option<Duration>,
@@ -57,7 +66,7 @@ pub struct Submit {
     #[arg(long, default_value = "")]
     task_id: String,
     /// A list instead: .jsonl, .csv, or .tasks of a grid (then with --map).
-    #[arg(long, conflicts_with_all = ["from", "to", "sku", "same_robot_as", "coalesce_key", "wait"])]
+    #[arg(long, conflicts_with_all = ["from", "to", "sku", "type", "same_robot_as", "coalesce_key", "wait"])]
     file: Option<PathBuf>,
     /// The grid map a .tasks list belongs to.
     #[arg(long)]
@@ -69,26 +78,23 @@ pub struct Submit {
     change: Change,
 }
 
+/// A field and its value, which may be empty.
+fn field_value(text: &str) -> Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((name, value)) if !name.is_empty() => Ok((name.to_owned(), value.to_owned())),
+        _ => Err("must be NAME=VALUE".to_owned()),
+    }
+}
+
 /// Submits a task, or a list of them.
 pub async fn run(args: Submit, out: &Out) -> Result<(), Exit> {
     if let Some(path) = &args.file {
         return submit_list(&args, path, out).await;
     }
-    let transport = Transport {
-        kind: if args.from.is_empty() { "patrol" } else { "transport" }.to_owned(),
-        priority: args.priority,
-        robot_id: args.robot.clone(),
-        from_waypoint: args.from.clone(),
-        to_waypoint: args.to.clone().unwrap_or_default(),
-        item_sku: args.sku.clone(),
-        timeout_ms: i64::try_from(args.timeout.as_millis()).ok(),
-        max_retry_times: Some(args.retries),
-        retry_interval_ms: None,
-        schedule_to_start_ms: args.schedule_to_start.and_then(|t| i64::try_from(t.as_millis()).ok()),
-        same_robot_as: args.same_robot_as.clone(),
-        coalesce_key: args.coalesce_key.clone(),
+    let mut message = match &args.r#type {
+        Some(name) => typed(&args, name)?,
+        None => request(&transport(&args)),
     };
-    let mut message = request(&transport);
     message.request_id = args.change.request_id.clone();
     message.task_id = args.task_id.clone();
     message.validate_only = args.change.dry_run;
@@ -106,6 +112,51 @@ pub async fn run(args: Submit, out: &Out) -> Result<(), Exit> {
         out.next(&format!("midshift task wait {}", task.task_id));
     }
     Ok(())
+}
+
+fn transport(args: &Submit) -> Transport {
+    let milliseconds = |time: Duration| i64::try_from(time.as_millis()).ok();
+    Transport {
+        kind: if args.from.is_empty() { "patrol" } else { "transport" }.to_owned(),
+        priority: args.priority,
+        robot_id: args.robot.clone(),
+        from_waypoint: args.from.clone(),
+        to_waypoint: args.to.clone().unwrap_or_default(),
+        item_sku: args.sku.clone(),
+        timeout_ms: milliseconds(args.timeout.unwrap_or(TIMEOUT)),
+        max_retry_times: Some(args.retries),
+        retry_interval_ms: None,
+        schedule_to_start_ms: args.schedule_to_start.and_then(milliseconds),
+        same_robot_as: args.same_robot_as.clone(),
+        coalesce_key: args.coalesce_key.clone(),
+    }
+}
+
+/// A task by type and fields. Values go as text: the server reads them as the type says.
+fn typed(args: &Submit, name: &str) -> Result<v1::SubmitTaskRequest, Exit> {
+    let mut fields = prost_types::Struct::default();
+    for (field, value) in &args.field {
+        let text = prost_types::value::Kind::StringValue(value.clone());
+        if fields.fields.insert(field.clone(), prost_types::Value { kind: Some(text) }).is_some() {
+            return Err(Exit::new(2, format!("--field {field} is there twice")));
+        }
+    }
+    let small = |number: i64| i32::try_from(number).unwrap_or(i32::MAX);
+    let seconds = |time: Duration| i32::try_from(time.as_secs()).unwrap_or(i32::MAX);
+    let typed = v1::TypedTask {
+        r#type: name.to_owned(),
+        fields: Some(fields),
+        robot_id: args.robot.clone(),
+        priority: args.priority.map(small),
+        timeout_seconds: args.timeout.map(seconds),
+        max_retry_times: Some(small(args.retries)),
+        schedule_to_start_seconds: args.schedule_to_start.map(seconds),
+        same_robot_as: args.same_robot_as.clone(),
+        coalesce_key: args.coalesce_key.clone(),
+        ..v1::TypedTask::default()
+    };
+    let body = Some(v1::submit_task_request::Body::Typed(typed));
+    Ok(v1::SubmitTaskRequest { body, ..v1::SubmitTaskRequest::default() })
 }
 
 /// Refuses to send tasks for robots that the server does not know: one task of each robot is checked, and nothing is
@@ -148,6 +199,7 @@ fn robot_of(task: &v1::SubmitTaskRequest) -> &str {
         Some(Body::Spec(spec)) => &spec.robot_id,
         Some(Body::Flat(flat)) => &flat.robot_id,
         Some(Body::Nested(nested)) => &nested.robot_id,
+        Some(Body::Typed(typed)) => &typed.robot_id,
         None => "",
     }
 }

@@ -13,6 +13,10 @@ const VIOLATIONS_MAX: usize = 100;
 /// Columns that hold text.
 const TEXT_COLUMNS: [&str; 7] =
     ["task_type", "from_waypoint", "to_waypoint", "item_sku", "robot_id", "same_robot_as", "coalesce_key"];
+/// Text columns of a transport alone.
+const TRANSPORT_COLUMNS: [&str; 3] = ["from_waypoint", "to_waypoint", "item_sku"];
+/// What the name of a column begins with that holds a field of a registered type.
+const FIELD_COLUMN: &str = "fields.";
 /// Columns that hold whole numbers.
 const NUMBER_COLUMNS: [&str; 5] =
     ["priority", "timeout_seconds", "max_retry_times", "retry_interval_seconds", "schedule_to_start_seconds"];
@@ -55,8 +59,9 @@ pub fn parse_jsonl(text: &str) -> Result<Vec<ListedTask>, Refusal> {
     finish(v, tasks)
 }
 
-/// Reads CSV into the flat JSON form. The first row names the columns, in any order; `task_type`, `to_waypoint` and
-/// `timeout_seconds` must be among them; an empty cell is an absent field. Errors: each bad line, up to 100.
+/// Reads CSV into the flat JSON form, or, where columns are called `fields.NAME`, into that of tasks by type and fields. The
+/// first row names the columns, in any order. `task_type` must be among them, and for the flat form `to_waypoint` and
+/// `timeout_seconds`; an empty cell is an absent field. Errors: each bad line, up to 100.
 pub fn parse_csv(text: &str) -> Result<Vec<ListedTask>, Refusal> {
     check_size(text)?;
     let mut v = Violations::default();
@@ -65,18 +70,7 @@ pub fn parse_csv(text: &str) -> Result<Vec<ListedTask>, Refusal> {
         Ok(row) => row.iter().map(str::to_owned).collect(),
         Err(e) => return Err(Refusal::field("line 1", format!("is no CSV: {e}"))),
     };
-    for (at, name) in columns.iter().enumerate() {
-        if !TEXT_COLUMNS.contains(&name.as_str()) && !NUMBER_COLUMNS.contains(&name.as_str()) {
-            v.add("header", format!("{name:?} is none of {}, {}", TEXT_COLUMNS.join(", "), NUMBER_COLUMNS.join(", ")));
-        } else if columns[..at].contains(name) {
-            v.add("header", format!("{name:?} is there twice"));
-        }
-    }
-    for name in ["task_type", "to_waypoint", "timeout_seconds"] {
-        if !columns.iter().any(|c| c == name) {
-            v.add("header", format!("{name:?} is missing"));
-        }
-    }
+    check_columns(&columns, &mut v);
     if !v.0.is_empty() {
         return Err(Refusal::invalid(v.0));
     }
@@ -100,6 +94,31 @@ pub fn parse_csv(text: &str) -> Result<Vec<ListedTask>, Refusal> {
     finish(v, tasks)
 }
 
+fn is_field(column: &str) -> bool {
+    column.strip_prefix(FIELD_COLUMN).is_some_and(|name| !name.is_empty())
+}
+
+fn check_columns(columns: &[String], v: &mut Violations) {
+    let is_typed = columns.iter().any(|name| is_field(name));
+    for (at, name) in columns.iter().enumerate() {
+        let is_known = TEXT_COLUMNS.contains(&name.as_str()) || NUMBER_COLUMNS.contains(&name.as_str());
+        if is_typed && TRANSPORT_COLUMNS.contains(&name.as_str()) {
+            v.add("header", format!("{name:?} is of a transport, and cannot be with columns fields.NAME of a type"));
+        } else if !is_known && !is_field(name) {
+            let known = [TEXT_COLUMNS.join(", "), NUMBER_COLUMNS.join(", ")].join(", ");
+            v.add("header", format!("{name:?} is none of {known}, fields.NAME"));
+        } else if columns[..at].contains(name) {
+            v.add("header", format!("{name:?} is there twice"));
+        }
+    }
+    let needed: &[&str] = if is_typed { &["task_type"] } else { &["task_type", "to_waypoint", "timeout_seconds"] };
+    for name in needed {
+        if !columns.iter().any(|c| c == name) {
+            v.add("header", format!("{name:?} is missing"));
+        }
+    }
+}
+
 /// The line that a row stands on: the reader's position is before the empty lines and comments that it skipped.
 fn row_line(text: &str, position: Option<&csv::Position>) -> usize {
     let Some(position) = position else { return 0 };
@@ -108,15 +127,22 @@ fn row_line(text: &str, position: Option<&csv::Position>) -> usize {
 }
 
 fn row_task(v: &mut Violations, line: usize, columns: &[String], row: &csv::StringRecord) -> Value {
-    let mut task = Map::new();
+    let (mut task, mut fields) = (Map::new(), Map::new());
+    let is_typed = columns.iter().any(|name| is_field(name));
     for (name, cell) in columns.iter().zip(row).filter(|(_, cell)| !cell.is_empty()) {
-        if !NUMBER_COLUMNS.contains(&name.as_str()) {
-            task.insert(name.clone(), Value::from(cell));
+        if let Some(field) = name.strip_prefix(FIELD_COLUMN) {
+            fields.insert(field.to_owned(), Value::from(cell));
+        } else if !NUMBER_COLUMNS.contains(&name.as_str()) {
+            let name = if is_typed && name == "task_type" { "type" } else { name };
+            task.insert(name.to_owned(), Value::from(cell));
         } else if let Ok(number) = cell.parse::<i64>() {
             task.insert(name.clone(), Value::from(number));
         } else {
             v.add(format!("line {line}.{name}"), format!("{cell:?} is not a whole number"));
         }
+    }
+    if is_typed {
+        task.insert("fields".to_owned(), Value::Object(fields));
     }
     Value::Object(task)
 }
@@ -159,6 +185,17 @@ mod tests {
             "item_sku": "SKU, red", "timeout_seconds": 600, "max_retry_times": 2, "retry_interval_seconds": 5});
         let second = json!({"task_type": "patrol", "to_waypoint": "P01", "timeout_seconds": 60, "robot_id": "rbt-01"});
         assert_eq!(tasks, [(2, first), (5, second)].map(|(line, task)| ListedTask { line, task }));
+    }
+
+    #[test]
+    fn a_csv_with_columns_of_fields_becomes_tasks_by_type_and_fields() {
+        let text = "task_type,priority,fields.shelf,fields.height_mm\nshelf-scan,3,A01,1200\nshelf-scan,,B03,\n";
+        let first = json!({"type": "shelf-scan", "priority": 3, "fields": {"shelf": "A01", "height_mm": "1200"}});
+        let second = json!({"type": "shelf-scan", "fields": {"shelf": "B03"}});
+        let tasks = parse_csv(text).expect("reads");
+        assert_eq!(tasks, [(2, first), (3, second)].map(|(line, task)| ListedTask { line, task }));
+        let refusal = parse_csv("fields.shelf,to_waypoint,fields.\n").expect_err("a transport, no name and no type");
+        assert_eq!(fields(&refusal), ["header"; 3]);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! What a task is, how it is checked on receipt, and how it moves: business intent that survives robots, restarts and changes of mind.
 //!
 //! `raw` is what a caller sent, `spec` what it means once every rule holds, `forms` the short forms callers may use,
-//! `machine` the table of transitions, `state` the rows, `edit` what people change of a task, `requests` what they ask
+//! `types` the task types that a site knows, `machine` the table of transitions, `state` the rows, `edit` what people change of a task, `requests` what they ask
 //! of it. Services never decide a transition by themselves.
 
 pub mod bugs;
@@ -13,6 +13,7 @@ pub mod raw;
 pub mod requests;
 pub mod spec;
 pub mod state;
+pub mod types;
 
 pub use edit::TaskEdit;
 pub use machine::{AfterStopping, Event, Phase};

@@ -107,7 +107,8 @@ pub struct RawRetry {
     pub exclude_failed_robot: bool,
 }
 
-fn name_ok(text: &str) -> bool {
+/// Whether this may name a type, a capability, an action or a field: 1-64 of [a-z0-9-_].
+pub(super) fn name_ok(text: &str) -> bool {
     (1..=64).contains(&text.len())
         && text.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || matches!(c, '-' | '_'))
 }

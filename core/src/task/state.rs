@@ -9,7 +9,7 @@ use crate::limits;
 use crate::reason::{Code, Reason};
 use crate::robot::Fault;
 use crate::robot_events::WorkStats;
-use crate::rows::{Index, Record, Table, body_is_json};
+use crate::rows::{Index, Record, Revision, Table, body_is_json};
 use crate::time::Utc;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -31,6 +31,9 @@ pub struct TaskIntake {
     pub created: Utc,
     /// Admission number: rises by one a task of one process, and orders lists. Several processes may give the same one.
     pub number: u64,
+    /// Revision of the type `spec.kind` whose steps these are. None: they were sent as steps, or as a transport.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub type_revision: Option<Revision>,
 }
 
 impl Record for TaskIntake {

@@ -206,7 +206,8 @@ pub(crate) fn from_struct(wire: Option<Struct>, at: At<'_>, bad: &mut Violations
         .collect()
 }
 
-fn from_value(wire: prost_types::Value, at: At<'_>, bad: &mut Violations) -> Option<Value> {
+/// A value as JSON. None: it cannot be, which is noted.
+pub(crate) fn from_value(wire: prost_types::Value, at: At<'_>, bad: &mut Violations) -> Option<Value> {
     Some(match wire.kind {
         None => {
             bad.add(at.to_string(), "is a value without a kind; null has one too");

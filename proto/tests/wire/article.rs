@@ -2,7 +2,8 @@
 
 use midshift_core::step::{Effect, StepKind};
 use midshift_core::task::TaskSpec;
-use midshift_proto::convert::task::Submission;
+use midshift_core::task::types::TypeCatalogue;
+use midshift_proto::convert::submission::Submission;
 use midshift_proto::json::from_json;
 use midshift_proto::task::v1::SubmitTaskRequest;
 use serde_json::{Value, json};
@@ -15,7 +16,7 @@ fn golden(name: &str) -> Value {
 fn submitted(form: &str) -> (Submission, TaskSpec) {
     let request = json!({ form: golden(&format!("article_{form}")) });
     let read = || Submission::read(from_json::<SubmitTaskRequest>(request.clone()).expect("the form as it stands"));
-    (read(), read().check(&|w| ["A01", "B03"].contains(&w.as_str())).expect("valid"))
+    (read(), read().check(&|w| ["A01", "B03"].contains(&w.as_str()), &TypeCatalogue::default()).expect("valid").spec)
 }
 
 #[test]
@@ -72,7 +73,7 @@ fn a_short_form_hears_its_violations_by_its_own_names() {
     ];
     for (request, wanted) in cases {
         let submission = Submission::read(from_json(request).expect("json"));
-        let refusal = submission.check(&|_| false).expect_err("invalid");
+        let refusal = submission.check(&|_| false, &TypeCatalogue::default()).expect_err("invalid");
         let mut fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
         fields.sort_unstable();
         assert_eq!(fields, wanted);
@@ -84,6 +85,6 @@ fn two_different_task_ids_in_one_request_are_refused() {
     let mut body = golden("article_flat");
     body["task_id"] = json!("TASK-A");
     let submission = Submission::read(from_json(json!({"task_id": "TASK-B", "flat": body})).expect("json"));
-    let refusal = submission.check(&|_| true).expect_err("invalid");
+    let refusal = submission.check(&|_| true, &TypeCatalogue::default()).expect_err("invalid");
     assert_eq!(refusal.violations[0].field, "task_id");
 }

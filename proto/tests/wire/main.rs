@@ -7,5 +7,6 @@ mod fleet;
 mod link;
 mod privacy;
 mod task;
+mod task_type;
 mod telemetry;
 mod unknown;

@@ -31,6 +31,8 @@ const SHAPELESS: &[(&str, usize, &str)] = &[
     ("midshift.ota.v1.PlanRolloutResponse.wave_sizes", limits::CONTROL_MESSAGE_BYTES, "core/src/rollout"),
     ("midshift.stop.v1.Stop.boxes", limits::REGION_BOXES_MAX, "proto/src/convert/stop.rs"),
     ("midshift.task.v1.Action.params", limits::PARAMS_BYTES_MAX, "core/src/task"),
+    ("midshift.task.v1.TaskTypeField.default", limits::TYPE_TEXT_BYTES_MAX as usize, "core/src/task/types"),
+    ("midshift.task.v1.TypedTask.fields", limits::TASK_MESSAGE_BYTES, "core/src/task/types"),
     ("midshift.task.v1.UpdateTaskRequest.update_mask", limits::CONTROL_MESSAGE_BYTES, "proto/src/convert/task.rs"),
 ];
 

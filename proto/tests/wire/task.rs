@@ -3,9 +3,11 @@
 use midshift_core::ids::TaskId;
 use midshift_core::reason::{Code, Reason};
 use midshift_core::rows::Revision;
+use midshift_core::task::types::TypeCatalogue;
 use midshift_core::task::{Phase, Resolution, TaskIntake, TaskSpec, TaskState};
 use midshift_core::time::Utc;
-use midshift_proto::convert::task::{Submission, TaskFilter, TaskView, canonical, encode_task, revision_of};
+use midshift_proto::convert::submission::{Submission, canonical};
+use midshift_proto::convert::task::{TaskFilter, TaskView, encode_task, revision_of};
 use midshift_proto::json::from_json;
 use midshift_proto::task::v1::{self, SubmitTaskRequest, submit_task_request::Body};
 use serde_json::json;
@@ -29,7 +31,7 @@ fn full_spec() -> serde_json::Value {
 
 fn spec_of(value: serde_json::Value) -> TaskSpec {
     let request: SubmitTaskRequest = from_json(json!({ "spec": value })).expect("json");
-    Submission::read(request).check(&|_| true).expect("valid")
+    Submission::read(request).check(&|_| true, &TypeCatalogue::default()).expect("valid").spec
 }
 
 #[test]
@@ -37,7 +39,7 @@ fn a_spec_comes_back_as_it_was_understood() {
     let spec = spec_of(full_spec());
     let body = Some(Body::Spec(v1::TaskSpec::from(&spec)));
     let again = Submission::read(SubmitTaskRequest { body, ..SubmitTaskRequest::default() });
-    let again = again.check(&|_| true).expect("valid");
+    let again = again.check(&|_| true, &TypeCatalogue::default()).expect("valid").spec;
     assert_eq!(again, spec);
     assert_eq!(
         (spec.steps[2].effect, spec.steps[1].timeout_ms, spec.not_before),
@@ -51,7 +53,7 @@ fn an_enum_said_as_unspecified_is_a_violation_and_not_the_default() {
     value["steps"][0]["effect"] = json!("STEP_EFFECT_UNSPECIFIED");
     value["steps"][1]["onFail"] = json!(0);
     let request: SubmitTaskRequest = from_json(json!({ "spec": value })).expect("json");
-    let refusal = Submission::read(request).check(&|_| true).expect_err("invalid");
+    let refusal = Submission::read(request).check(&|_| true, &TypeCatalogue::default()).expect_err("invalid");
     let fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
     assert_eq!(fields, ["spec.steps[0].effect", "spec.steps[1].on_fail"]);
 }
@@ -59,10 +61,12 @@ fn an_enum_said_as_unspecified_is_a_violation_and_not_the_default() {
 #[test]
 fn ids_and_rules_are_refused_in_one_answer() {
     let request = from_json(json!({"request_id": "with space", "task_id": "§", "spec": {"type": "x"}})).expect("json");
-    let refusal = Submission::read(request).check(&|_| true).expect_err("invalid");
+    let refusal = Submission::read(request).check(&|_| true, &TypeCatalogue::default()).expect_err("invalid");
     let fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
     assert_eq!(fields, ["request_id", "task_id", "spec.timeout", "spec.steps"]);
-    let refusal = Submission::read(SubmitTaskRequest::default()).check(&|_| true).expect_err("invalid");
+    let refusal = Submission::read(SubmitTaskRequest::default())
+        .check(&|_| true, &TypeCatalogue::default())
+        .expect_err("invalid");
     assert_eq!(refusal.violations[0].field, "body");
 }
 
@@ -73,7 +77,7 @@ fn a_parameter_that_json_cannot_say_is_refused_by_its_path() {
     let Some(v1::step::Kind::Action(action)) = &mut spec.steps[1].kind else { panic!("an action") };
     let number = Some(prost_types::value::Kind::NumberValue(f64::NAN));
     action.params.get_or_insert_default().fields.insert("f".to_owned(), prost_types::Value { kind: number });
-    let refusal = Submission::read(request).check(&|_| true).expect_err("invalid");
+    let refusal = Submission::read(request).check(&|_| true, &TypeCatalogue::default()).expect_err("invalid");
     let fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
     assert_eq!(fields, ["spec.steps[1].action.params.f"]);
 }
@@ -91,7 +95,7 @@ fn times_that_are_none_are_each_refused_once_by_their_field() {
     (retry.interval, retry.max_interval) = (span, span);
     spec.steps[1].timeout = span;
     spec.steps[2].kind = Some(v1::step::Kind::Wait(v1::Wait { duration: span }));
-    let refusal = Submission::read(request).check(&|_| true).expect_err("invalid");
+    let refusal = Submission::read(request).check(&|_| true, &TypeCatalogue::default()).expect_err("invalid");
     let mut fields: Vec<_> = refusal.violations.iter().map(|v| v.field.as_str()).collect();
     fields.sort_unstable();
     let names = [
@@ -126,6 +130,7 @@ fn rows() -> (TaskIntake, TaskState) {
         payload_hash: String::new(),
         created: Utc(1_780_300_000_000),
         number: 42,
+        type_revision: None,
     };
     let state = TaskState::born(&intake);
     (intake, state)

@@ -657,6 +657,17 @@ CREATE TABLE task_state (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE task_type (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE telemetry_event (
     site_id TEXT NOT NULL,
     seq BIGINT NOT NULL,

@@ -124,6 +124,7 @@ pub(crate) const CONTROL: &[Migration] = migrations!["control":
     "0102_no_task_request_by_parent",
     "0103_planner_policy",
     "0104_place_block",
+    "0105_task_type",
 ];
 
 /// Of `telemetry.db`.

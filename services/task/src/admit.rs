@@ -12,13 +12,16 @@ use midshift_core::item::Item;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violation};
 use midshift_core::rows::{Table, Writer};
 use midshift_core::task::requests::RequestKey;
+use midshift_core::task::types::TypeCatalogue;
 use midshift_core::task::{TaskIntake, TaskSpec, TaskState};
 use midshift_core::time::Utc;
 use midshift_proto::convert::shown;
-use midshift_proto::convert::task::{Submission, canonical, encode_checked};
+use midshift_proto::convert::submission::{CheckedTask, Submission, canonical};
+use midshift_proto::convert::task::encode_checked;
 use midshift_proto::task::v1;
 use midshift_store::{Applied, CommitError, load};
 use sha2::{Digest, Sha256};
+use std::sync::Arc;
 
 /// Draws of a task id before the store is suspected.
 const DRAWS: usize = 8;
@@ -29,7 +32,7 @@ const BASE32: &[u8; 32] = b"0123456789ABCDEFGHJKMNPQRSTVWXYZ";
 struct Wanted {
     request_id: Option<RequestId>,
     task_id: Option<TaskId>,
-    spec: TaskSpec,
+    task: CheckedTask,
     hash: String,
 }
 
@@ -104,8 +107,10 @@ impl TaskService {
         let submission = Submission::read(request);
         let (request_id, task_id) = (submission.request_id.clone(), submission.task_id.clone());
         let site = &self.inner.parts.site;
-        let spec = submission.check(&|waypoint| site.find(waypoint).is_some())?;
-        self.dispatches(&spec, by)?;
+        let types = if submission.needs_types() { self.types().await? } else { Arc::new(TypeCatalogue::default()) };
+        let task = submission.check(&|waypoint| site.find(waypoint).is_some(), &types)?;
+        let spec = &task.spec;
+        self.dispatches(spec, by)?;
         let depends_on =
             spec.depends_on.iter().enumerate().map(|(i, id)| (format!("spec.depends_on[{i}]"), id.clone()));
         let same_robot_as = spec.same_robot_as.iter().map(|id| ("spec.same_robot_as".to_owned(), id.clone()));
@@ -120,7 +125,7 @@ impl TaskService {
                 return Err(Refusal::invalid(violations));
             }
         }
-        Ok(Wanted { request_id, task_id, spec, hash })
+        Ok(Wanted { request_id, task_id, task, hash })
     }
 
     fn dispatches(&self, spec: &TaskSpec, by: &Caller) -> Result<(), Refusal> {
@@ -140,12 +145,13 @@ impl TaskService {
         let task_id = wanted.task_id.clone().unwrap_or_else(drawn);
         let intake = TaskIntake {
             task_id: task_id.clone(),
-            spec: wanted.spec.clone(),
+            spec: wanted.task.spec.clone(),
             actor,
             request_id: wanted.request_id.as_ref().map(ToString::to_string).unwrap_or_default(),
             payload_hash: wanted.hash.clone(),
             created: now.utc,
             number,
+            type_revision: wanted.task.type_revision,
         };
         let mut item = Item::new(Writer::Task, by);
         item.request_id = wanted.request_id.as_ref().map(|id| id.as_str().into());
@@ -272,8 +278,8 @@ impl TaskService {
             notes: notes.iter().map(shown).collect(),
         };
         if request.validate_only {
-            let spec = self.check(request, by).await?.spec;
-            return Ok(answer(encode_checked(&spec), self.notes(&spec.robot_id).await?));
+            let task = self.check(request, by).await?.task;
+            return Ok(answer(encode_checked(&task), self.notes(&task.spec.robot_id).await?));
         }
         let durable = match self.prepare(request, by).await? {
             Prepared::New(admission) => self.admit(*admission, by).await?,

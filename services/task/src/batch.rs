@@ -169,6 +169,7 @@ fn named_ids(request: &v1::SubmitTaskRequest) -> impl Iterator<Item = &String> {
         Some(Body::Spec(spec)) => (spec.depends_on.as_slice(), Some(&spec.same_robot_as)),
         Some(Body::Flat(flat)) => (&[][..], Some(&flat.same_robot_as)),
         Some(Body::Nested(nested)) => (&[][..], Some(&nested.same_robot_as)),
+        Some(Body::Typed(typed)) => (typed.depends_on.as_slice(), Some(&typed.same_robot_as)),
         None => (&[][..], None),
     };
     depends_on.iter().chain(same_robot_as)
@@ -179,6 +180,7 @@ fn chosen_id(request: &v1::SubmitTaskRequest) -> &str {
         _ if !request.task_id.is_empty() => &request.task_id,
         Some(Body::Flat(flat)) => &flat.task_id,
         Some(Body::Nested(nested)) => &nested.task_id,
+        Some(Body::Typed(typed)) => &typed.task_id,
         Some(Body::Spec(_)) | None => "",
     }
 }

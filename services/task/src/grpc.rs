@@ -130,6 +130,34 @@ impl Face for TaskService {
         let (id, by) = (CallId::of_request(&r, &r.get_ref().request_id), caller(&r));
         id.answer(self.resume(r.into_inner(), &by).await)
     }
+    async fn list_task_types(
+        &self,
+        r: Request<v1::ListTaskTypesRequest>,
+    ) -> Result<Response<v1::ListTaskTypesResponse>, Status> {
+        let id = CallId::of_request(&r, "");
+        id.answer(self.list_types().await)
+    }
+    async fn put_task_type(
+        &self,
+        r: Request<v1::PutTaskTypeRequest>,
+    ) -> Result<Response<v1::PutTaskTypeResponse>, Status> {
+        let (id, by) = (CallId::of_request(&r, ""), caller(&r));
+        id.answer(self.put_type(r.into_inner(), &by).await)
+    }
+    async fn delete_task_type(
+        &self,
+        r: Request<v1::DeleteTaskTypeRequest>,
+    ) -> Result<Response<v1::DeleteTaskTypeResponse>, Status> {
+        let (id, by) = (CallId::of_request(&r, ""), caller(&r));
+        id.answer(self.delete_type(r.into_inner(), &by).await)
+    }
+    async fn put_task_type_rules(
+        &self,
+        r: Request<v1::PutTaskTypeRulesRequest>,
+    ) -> Result<Response<v1::PutTaskTypeRulesResponse>, Status> {
+        let (id, by) = (CallId::of_request(&r, ""), caller(&r));
+        id.answer(self.put_type_rules(r.into_inner(), &by).await)
+    }
     async fn watch_tasks(&self, r: Request<v1::WatchTasksRequest>) -> Result<Response<Self::WatchTasksStream>, Status> {
         let (id, by) = (CallId::of_request(&r, ""), caller(&r));
         let (teller, reader) = watches::watch();

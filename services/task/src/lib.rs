@@ -9,15 +9,18 @@ mod batch;
 mod commands;
 mod filtered_commands;
 mod grpc;
+mod known_types;
 mod list;
 mod prune;
 mod resume;
 mod rows;
 mod search;
 mod task_changes;
+mod types;
 mod watch;
 mod watch_state;
 
+use known_types::KnownTypes;
 use midshift_core::Boxed;
 use midshift_core::item::Item;
 use midshift_core::limits;
@@ -29,8 +32,8 @@ use midshift_core::task::bugs::Bugs;
 use midshift_core::time::Clock;
 use midshift_proto::task::v1::task_service_server::TaskServiceServer;
 use midshift_store::{Applied, CommitError, Error, Query, Store};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, Mutex};
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 use tonic::codec::CompressionEncoding;
@@ -54,6 +57,8 @@ struct Inner {
     number: AtomicU64,
     /// Drawn at the start, so that two processes do not draw the same ids.
     salt: u64,
+    /// The task types of the site as they were read last.
+    types: Mutex<Option<KnownTypes>>,
     shutdown: CancellationToken,
 }
 
@@ -77,7 +82,9 @@ impl TaskService {
                 None => 0,
             };
             let number = AtomicU64::new(number);
-            Ok(Self { inner: Arc::new(Inner { parts, number, salt: rand::random(), shutdown }) })
+            Ok(Self {
+                inner: Arc::new(Inner { parts, number, salt: rand::random(), types: Mutex::default(), shutdown }),
+            })
         })
     }
     /// With the gRPC face.

@@ -53,6 +53,31 @@ const TABLE: &str = "task_type,from_waypoint,to_waypoint,timeout_seconds\ntransp
 const RELEASE: &str = "name = \"walk\"\nversion = \"1.5.0\"\n[[component]]\nname = \"gait\"\nversion = \"1.5.0\"\nkind = \"process\"\nfile = \"gait\"\nhardware = [\"h1\", \"midshift-sim\"]\nneeds = \"restart\"\n";
 const BAD_RELEASE: &str = "name = \"Walk\"\nversion = \"1.5\"\n[[component]]\nname = \"gait\"\nversion = \"1.5.0\"\nkind = \"base\"\nfile = \"gait\"\nhardware = []\nneeds = \"park\"\n";
 
+/// Two mistakes of a type, and a good one.
+const BAD_TYPE: &str = "name = \"Look\"\ndescription = \"Looks at a shelf.\"\nfields = [{ name = \"shelf\", description = \"Which shelf.\", waypoint = {} }]\nsteps = [{ goto = { field = \"shlef\" } }]\n";
+const TYPE: &str = "name = \"shelf-look\"\ndescription = \"Looks at a shelf.\"\ntimeout = \"60s\"\nfields = [{ name = \"shelf\", description = \"Which shelf.\", waypoint = {} }, { name = \"height_mm\", description = \"Where it looks.\", integer = { least = 0, most = 2000, unit = \"mm\" }, default = 900 }]\nsteps = [{ goto = { field = \"shelf\" } }, { action = { name = \"inspect\", params = { height_mm = \"height_mm\" } } }]\n";
+
+/// Task types: registered, used, deleted.
+fn types_of_tasks(t: &mut Transcript) -> anyhow::Result<()> {
+    std::fs::write(t.dir.join("bad-type.toml"), BAD_TYPE)?;
+    std::fs::write(t.dir.join("type.toml"), TYPE)?;
+    t.note(&["task", "type", "put", "bad-type.toml"])?;
+    t.note(&["task", "type", "put", "type.toml", "--dry-run"])?;
+    t.note(&["task", "type", "put", "type.toml", "-o", "json"])?;
+    t.note(&["task", "type", "ls"])?;
+    t.note(&["task", "type", "get", "shelf-look"])?;
+    t.note(&["task", "type", "get", "shelf-lok"])?;
+    let submit = ["task", "submit", "--type", "shelf-look", "--dry-run"];
+    t.note(&[&submit[..], &["--field", "shelf=B", "--field", "height_mm=1200", "-o", "json"]].concat())?;
+    t.note(&[&submit[..], &["--field", "shlef=B", "--field", "height_mm=9000"]].concat())?;
+    t.note(&["task", "submit", "--type", "shelf-lok", "--dry-run"])?;
+    t.note(&["task", "type", "accept", "known"])?;
+    t.note(&["task", "type", "accept", "any"])?;
+    t.note(&["task", "type", "delete", "shelf-look"])?;
+    t.note(&["task", "type", "delete", "shelf-lok"])?;
+    Ok(())
+}
+
 fn bundles(dir: &Path) -> anyhow::Result<()> {
     for (name, text) in [("walk", RELEASE), ("bad", BAD_RELEASE)] {
         let folder = dir.join(name);
@@ -476,6 +501,7 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["task", "resume", "--robot", "r1", "--reason", "all clear", "-o", "json"])?;
     t.note(&["task", "resume", "--robot", "r1"])?;
     for_people(&mut t)?;
+    types_of_tasks(&mut t)?;
 
     // Lists.
     std::fs::write(t.dir.join("list.jsonl"), LIST)?;

@@ -25,9 +25,10 @@ const LIMIT: Duration = Duration::from_secs(60);
 /// The robot that asks.
 const ASKS: &str = "rbt-03";
 /// Methods over objects whose requests name none, and why.
-const NAME_NOTHING: [(&str, &str); 2] = [
+const NAME_NOTHING: [(&str, &str); 3] = [
     ("GetEncoding", "names a file: what is published is for every robot"),
     ("FetchChunks", "names a file: what is published is for every robot"),
+    ("ListTaskTypes", "types are of the site, and whoever may read anything sees them"),
 ];
 /// Methods that find nothing here even of what a caller may see, and why.
 const NOTHING_HERE: [(&str, &str); 4] = [

@@ -126,6 +126,7 @@ impl Rig {
             payload_hash: String::new(),
             created: self.now.utc,
             number,
+            type_revision: None,
         };
         self.absorb(&intake);
         self.absorb(&TaskState::born(&intake));

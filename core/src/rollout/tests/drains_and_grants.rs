@@ -263,6 +263,7 @@ fn opened(rig: &mut Rig, n: usize, phase: crate::task::Phase) {
         payload_hash: String::new(),
         created: Utc(BEGIN),
         number: n as u64,
+        type_revision: None,
     };
     rig.put_row(TaskState {
         phase,

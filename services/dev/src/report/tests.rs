@@ -42,6 +42,7 @@ async fn admit(store: &Arc<dyn Store>, number: usize, request_id: &str, phase: P
         payload_hash: String::new(),
         created: clock::clock(1_000).now().utc,
         number: number as u64,
+        type_revision: None,
     };
     let state = TaskState { phase, ..TaskState::born(&intake) };
     let mut item = Item::new(Writer::Task, "");

@@ -13,5 +13,6 @@ mod lookups;
 mod many;
 mod prune;
 mod reach;
+mod types;
 mod watches;
 mod world;

@@ -93,6 +93,7 @@ macro_rules! records {
 records! {
     TaskIntake task::TaskIntake;
     TaskRequest task::TaskRequest;
+    TaskType task::types::TaskTypeRow;
     RequestKey task::requests::RequestKey;
     TaskState task::TaskState;
     Attempt task::Attempt;

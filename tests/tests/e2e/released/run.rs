@@ -86,11 +86,35 @@ pub async fn run(engine: Engine) -> anyhow::Result<Left> {
     Ok(Left { dir, database })
 }
 
+/// A task type with a field of each kind.
+const LOOK: &str = r#"
+name = "look"
+description = "Looks at a place."
+timeout = "60s"
+fields = [
+    { name = "at", description = "Where.", waypoint = {} },
+    { name = "pause", description = "Before.", integer = { least = 1, most = 9, unit = "s" }, default = 2 },
+    { name = "zoom", description = "Of it.", number = { least = 0.5, most = 4.0, unit = "" }, default = 1.5 },
+    { name = "note", description = "For people.", text = { max_bytes = 64 }, default = "" },
+    { name = "side", description = "Of it.", choice = { choices = ["left", "right"] }, default = "left" },
+]
+steps = [
+    { goto = { field = "at" } },
+    { wait = { field = "pause" } },
+    { action = { name = "inspect", params = { zoom = "zoom", note = "note", side = "side" } } },
+]
+"#;
+
 /// Tasks, rules, rights, and what people ask about tasks and robots.
 async fn work(line: Line) -> anyhow::Result<()> {
     line.done(&["token", "create", "orders", "--role", "operator", "--valid", "1d"])?;
     line.done(&["area", "put", "hall", "--speed-limit", "1400"])?;
     line.done(&["planner", "put", "--horizon", "20s"])?;
+    let folder = tempfile::tempdir()?;
+    let file = folder.path().join("look.toml");
+    std::fs::write(&file, LOOK)?;
+    line.done(&["task", "type", "put", &file.display().to_string()])?;
+    line.done(&["task", "type", "accept", "known"])?;
     line.submit("FIRST", "rbt-01")?;
     line.submit("SECOND", "rbt-02")?;
     line.done(&["robot", "cordon", "rbt-02", "--reason", "looked at", "--request-id", "cordon-1"])?;

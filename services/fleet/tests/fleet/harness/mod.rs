@@ -324,6 +324,7 @@ impl World {
             payload_hash: String::new(),
             created: self.clock.now().utc,
             number: self.submitted,
+            type_revision: None,
         };
         let mut item = Item::new(Writer::Task, "tests");
         item.create(&intake, "task.admitted").create(&TaskState::born(&intake), "task.queued");
