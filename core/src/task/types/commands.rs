@@ -179,7 +179,7 @@ mod tests {
 
     #[test]
     fn a_type_is_put_over_the_revision_that_was_seen_and_changes_nothing_when_it_is_there() {
-        let (put, changed) = (TypeCommand::Put(make_type("scan")), TaskType { timeout_ms: None, ..of("scan") });
+        let (put, changed) = (TypeCommand::Put(make_type("scan")), TaskType { timeout_ms: None, ..make_type("scan") });
         let there = [row(&TaskTypeRow::Type(make_type("scan")), 3)];
         let at = |expect| Ok(vec![("scan".to_owned(), expect, false)]);
         assert_eq!(decided(&put, &[], None), at(Expect::Absent));
@@ -221,7 +221,7 @@ mod tests {
         let types = (0..limits::TASK_TYPES_MAX).map(|n| row(&TaskTypeRow::Type(make_type(&format!("t{n}"))), 1));
         let types: Vec<Row> = types.collect();
         assert_eq!(decided(&put, &types, None), Err(Code::TaskTypesFull));
-        assert!(decided(&TypeCommand::Put(TaskType { timeout_ms: None, ..of("t0") }), &types, None).is_ok());
+        assert!(decided(&TypeCommand::Put(TaskType { timeout_ms: None, ..make_type("t0") }), &types, None).is_ok());
         let names = |at: i64| -> Vec<Row> {
             let was = |n: usize| row(&deleted(&format!("d{n}"), at + n as i64), 2);
             (0..limits::TASK_TYPE_NAMES_MAX).map(was).collect()
