@@ -71,6 +71,30 @@ impl TaskService for Unary {
     ) -> Result<Response<v1::ReleaseTaskResponse>, Status> {
         not_here()
     }
+    async fn list_task_types(
+        &self,
+        _: Request<v1::ListTaskTypesRequest>,
+    ) -> Result<Response<v1::ListTaskTypesResponse>, Status> {
+        not_here()
+    }
+    async fn put_task_type(
+        &self,
+        _: Request<v1::PutTaskTypeRequest>,
+    ) -> Result<Response<v1::PutTaskTypeResponse>, Status> {
+        not_here()
+    }
+    async fn delete_task_type(
+        &self,
+        _: Request<v1::DeleteTaskTypeRequest>,
+    ) -> Result<Response<v1::DeleteTaskTypeResponse>, Status> {
+        not_here()
+    }
+    async fn put_task_type_rules(
+        &self,
+        _: Request<v1::PutTaskTypeRulesRequest>,
+    ) -> Result<Response<v1::PutTaskTypeRulesResponse>, Status> {
+        not_here()
+    }
     async fn cancel_tasks(
         &self,
         _: Request<v1::CancelTasksRequest>,

@@ -15,25 +15,45 @@ pub fn nearest<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> impl Ite
     std::iter::from_fn(move || nearest.pop().map(|Reverse((_, known))| known)).take(NAMES_MAX)
 }
 
-/// Letters of the shortest name of which a slip can be told from another name.
+/// Letters of the shortest word of which a slip can be told from another word.
 const SLIP_LETTERS: usize = 5;
 /// Letters from which on two slips are told too.
 const TWO_SLIPS_LETTERS: usize = 8;
 
-/// The known names of which `name` is likely a slip of the hand, nearest first, at most 3: one letter more, less or
-/// another, two where names are long, or two neighbours that changed places. Numbers and words that are set apart are no
-/// slip: `line-2` is not `line-1`, and `transport-b` is not `transport`.
+/// The known names of which `name` is likely a slip of the hand, nearest first, at most 3: in one word one letter behind
+/// the first more, less or another, two where the word is long, or two neighbours that changed places. Other words and
+/// numbers are no slip: `dock-south` is not `dock-north`, `line-2` is not `line-1`, `transport-b` is not `transport`.
 pub fn misspelled<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> impl Iterator<Item = &'a str> {
     let slips = |known: &&'a str| is_slip(name, known);
     nearest(name, known.filter(slips).collect::<Vec<_>>().into_iter())
 }
 
 fn is_slip(name: &str, known: &str) -> bool {
+    fn words(text: &str) -> Vec<&str> {
+        text.split(['-', '_']).collect()
+    }
+    let (name, known) = (words(name), words(known));
+    if name.len() != known.len() {
+        return false;
+    }
+    let mut others = name.iter().zip(&known).filter(|(a, b)| a != b);
+    match (others.next(), others.next()) {
+        // The same words, set apart by another character.
+        (None, _) => true,
+        (Some((a, b)), None) => is_slip_of_word(a, b),
+        _ => false,
+    }
+}
+
+fn is_slip_of_word(name: &str, known: &str) -> bool {
     let digits = |text: &str| text.bytes().filter(u8::is_ascii_digit).collect::<Vec<_>>();
-    let words = |text: &str| text.split(['-', '_']).count();
     let letters_of = |text: &str| text.bytes().filter(u8::is_ascii_alphabetic).count();
     let letters = letters_of(name).min(letters_of(known));
-    if letters < SLIP_LETTERS || digits(name) != digits(known) || words(name) != words(known) {
+    let is_longer_word = |a: &str, b: &str| a.starts_with(b) && a.len() > b.len() + 1;
+    if letters < SLIP_LETTERS || digits(name) != digits(known) || name.bytes().next() != known.bytes().next() {
+        return false;
+    }
+    if is_longer_word(name, known) || is_longer_word(known, name) {
         return false;
     }
     let slips = if letters < TWO_SLIPS_LETTERS { 1 } else { 2 };
@@ -82,7 +102,8 @@ mod tests {
 
     #[test]
     fn a_slip_of_the_hand_is_told_from_another_name() {
-        let known = ["inspect", "line-1", "patrol", "pick", "pick-place", "transport"];
+        let known =
+            ["dock-north", "inspect", "line-1", "pallet-in", "patrol", "pick", "pick-place", "restock", "transport"];
         let found = |name| misspelled(name, known.into_iter()).collect::<Vec<_>>();
         for (slip, meant) in [
             ("transpot", "transport"),
@@ -104,6 +125,10 @@ mod tests {
             "line-1b",
             "transport-b",
             "transport2",
+            "transporter",
+            "dock-south",
+            "pallet-on",
+            "destock",
             "transfer",
             "visit",
             "",

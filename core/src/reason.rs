@@ -122,7 +122,7 @@ pub struct Violation {
 }
 
 /// Collects every violation of one request, so that a caller hears them all at once.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub struct Violations(pub Vec<Violation>);
 
 impl Violations {

@@ -3,8 +3,8 @@
 use midshift_agent::body::{Body, BodyNews, BodyOrder, PathPoint};
 use midshift_core::energy::fit::{AttemptWork, EnergySums, fit_robot};
 use midshift_core::energy::{CAPACITY_MWH, EnergyRates, RobotEnergy, Trip};
-use midshift_core::fleet::assignment::filters::RESERVE_PERMILLE;
 use midshift_core::ids::{RobotId, TaskId, WaypointId};
+use midshift_core::limits::CHARGE_RESERVE_PERMILLE;
 use midshift_core::limits::STOP_SLOW_MM_S;
 use midshift_core::site::route::Router;
 use midshift_core::site::{DEMO, Site, WaypointIx, text};
@@ -163,7 +163,7 @@ fn no_trip_of_a_simulated_body_costs_more_than_was_planned_nor_far_less() {
 
 #[test]
 fn a_hungry_body_spends_more_than_was_planned_and_never_the_reserve() {
-    let reserve = CAPACITY_MWH as u64 * RESERVE_PERMILLE / 1_000;
+    let reserve = CAPACITY_MWH as u64 * CHARGE_RESERVE_PERMILLE / 1_000;
     let costs: Vec<Cost> = (0..SEEDS).map(|seed| trip(seed, HUNGRY_PERMILLE)).collect();
     assert!(costs.iter().any(|cost| cost.spent > cost.planned), "the margin alone is not enough");
     for Cost { planned, spent, .. } in costs {

@@ -17,7 +17,7 @@ use prost::Message;
 const CREATED_AT: &str = "created_at";
 
 /// A task that a caller submits, before its rules were checked.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Submission {
     /// Protection against a double call.
     pub request_id: Option<RequestId>,

@@ -7,7 +7,7 @@ use crate::TaskService;
 use crate::rows::{TaskRows, are_seen, read, unavailable, unknown_robot};
 use midshift_core::audit::Note;
 use midshift_core::identity::{Caller, Permission};
-use midshift_core::ids::{RequestId, RobotId, TaskId};
+use midshift_core::ids::{RequestId, RobotId, TaskId, WaypointId};
 use midshift_core::item::Item;
 use midshift_core::reason::{Code, Kind, Reason, Refusal, Violation};
 use midshift_core::rows::{Table, Writer};
@@ -21,7 +21,6 @@ use midshift_proto::convert::task::encode_checked;
 use midshift_proto::task::v1;
 use midshift_store::{Applied, CommitError, load};
 use sha2::{Digest, Sha256};
-use std::sync::Arc;
 
 /// Draws of a task id before the store is suspected.
 const DRAWS: usize = 8;
@@ -107,8 +106,20 @@ impl TaskService {
         let submission = Submission::read(request);
         let (request_id, task_id) = (submission.request_id.clone(), submission.task_id.clone());
         let site = &self.inner.parts.site;
-        let types = if submission.needs_types() { self.types().await? } else { Arc::new(TypeCatalogue::default()) };
-        let task = submission.check(&|waypoint| site.find(waypoint).is_some(), &types)?;
+        let knows = |waypoint: &WaypointId| site.find(waypoint).is_some();
+        let task = if submission.needs_types() {
+            // Another process may have registered a type that this one has not heard of yet.
+            let (again, types) = (submission.clone(), self.types().await?);
+            match submission.check(&knows, &types) {
+                Err(refusal) if refusal.kind() == Kind::Invalid => {
+                    let newest = self.newest_types().await?;
+                    again.check(&knows, &newest)?
+                }
+                checked => checked?,
+            }
+        } else {
+            submission.check(&knows, &TypeCatalogue::default())?
+        };
         let spec = &task.spec;
         self.dispatches(spec, by)?;
         let depends_on =

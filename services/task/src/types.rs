@@ -12,7 +12,7 @@ use midshift_core::identity::{Caller, Permission};
 use midshift_core::item::Item;
 use midshift_core::limits;
 use midshift_core::reason::{Code, Kind, Refusal, Violations};
-use midshift_core::rows::{Revision, Table, Writer};
+use midshift_core::rows::{Revision, Seq, Table, Writer};
 use midshift_core::task::types::definition::TypeRules;
 use midshift_core::task::types::{TypeCatalogue, TypeCommand};
 use midshift_proto::convert::At;
@@ -32,6 +32,16 @@ impl TaskService {
         if let Some(types) = self.kept_types().as_ref().filter(|known| known.head == head) {
             return Ok(types.types.clone());
         }
+        self.read_types(head).await
+    }
+
+    /// As [`Self::types`], whatever this process knows already: another one may have changed them a moment ago.
+    pub(crate) async fn newest_types(&self) -> Result<Arc<TypeCatalogue>, Refusal> {
+        let head = *self.store().wake().borrow();
+        self.read_types(head).await
+    }
+
+    async fn read_types(&self, head: Seq) -> Result<Arc<TypeCatalogue>, Refusal> {
         let query = Query { limit: limits::PAGE_MAX, ..Query::all(Table::TaskType) };
         let rows = self.store().list(query).await.map_err(unavailable)?;
         let types = Arc::new(TypeCatalogue::from_rows(&rows).map_err(unavailable)?);
@@ -97,7 +107,7 @@ impl TaskService {
         by: &Caller,
     ) -> Result<Arc<TypeCatalogue>, Refusal> {
         for _ in 0..TRIES {
-            let types = self.types().await?;
+            let types = self.newest_types().await?;
             let mut item = Item::new(Writer::Task, by);
             let decided = by
                 .authorize(Permission::Operate, [])
@@ -115,7 +125,7 @@ impl TaskService {
             // A wake may come later than the answer to a commit.
             *self.kept_types() = None;
             match result {
-                Ok(_) => return self.types().await,
+                Ok(_) => return self.newest_types().await,
                 Err(CommitError::Conflict { .. }) => {}
                 Err(CommitError::Unknown(_)) => return Err(Refusal::new(Kind::Unavailable, Code::CommitUnknown)),
                 Err(error) => return Err(unavailable(error)),

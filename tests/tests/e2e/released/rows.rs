@@ -100,6 +100,7 @@ records! {
     Timer fleet::rows::Timer;
     HoldToken fleet::rows::HoldToken;
     PlaceGrant fleet::rows::Place;
+    PlaceBlock fleet::rows::PlaceBlock;
     RobotAuthority fleet::rows::RobotAuthority;
     RobotControl fleet::rows::RobotControl;
     RobotCounter fleet::rows::RobotCounter;
