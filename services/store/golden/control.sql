@@ -339,6 +339,17 @@ CREATE TABLE ota_mark (
     UNIQUE (site_id, id)
 );
 
+CREATE TABLE place_block (
+    site_id TEXT NOT NULL,
+    id TEXT NOT NULL,
+    revision BIGINT NOT NULL,
+    state BIGINT,
+    parent TEXT,
+    ord BIGINT NOT NULL,
+    body TEXT NOT NULL,
+    UNIQUE (site_id, id)
+);
+
 CREATE TABLE place_grant (
     site_id TEXT NOT NULL,
     id TEXT NOT NULL,

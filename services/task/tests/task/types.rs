@@ -152,7 +152,7 @@ async fn a_type_changes_over_the_etag_that_was_seen_and_a_deleted_name_never_rep
     let World { service, store, .. } = World::new().await;
     let first = put(&service, shelf_scan()).await.expect("registered");
     assert_eq!(put(&service, shelf_scan()).await.expect("the same").etag, first.etag, "nothing changed");
-    assert_eq!(list(&service).await.types, [first.clone()]);
+    assert_eq!(list(&service).await.types, std::slice::from_ref(&first));
     let changed = v1::TaskType { description: "Reads it.".into(), ..first.clone() };
     let second = put(&service, changed).await.expect("changed");
     let stale = v1::TaskType { description: "Looks at it.".into(), ..first.clone() };
