@@ -13,6 +13,7 @@ const FILES: [&str; 24] = [
     "midshift/task/v1/task_type.proto",
     "midshift/fleet/v1/fleet.proto",
     "midshift/fleet/v1/fleet_service.proto",
+    "midshift/fleet/v1/place_block.proto",
     "midshift/fleet/v1/planner.proto",
     "midshift/identity/v1/audit_service.proto",
     "midshift/identity/v1/enrolment_service.proto",

@@ -43,7 +43,7 @@ pub enum Verb {
         call: Call,
         /// The place into which nobody is let.
         place_id: String,
-        /// Why.
+        /// Why nobody is let in.
         #[arg(long)]
         reason: String,
         /// Site time until that ends by itself; without it a person ends it.
@@ -58,7 +58,7 @@ pub enum Verb {
         call: Call,
         /// The place that is open again.
         place_id: String,
-        /// Why.
+        /// Why it may be entered again.
         #[arg(long)]
         reason: String,
         #[command(flatten)]
