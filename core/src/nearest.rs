@@ -17,6 +17,8 @@ pub fn nearest<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> impl Ite
 
 /// Letters of the shortest word of which a slip can be told from another word.
 const SLIP_LETTERS: usize = 5;
+/// Letters of the shortest word of which two that changed places are told.
+const SWAPPED_LETTERS: usize = 4;
 /// Letters from which on two slips are told too.
 const TWO_SLIPS_LETTERS: usize = 8;
 
@@ -50,15 +52,17 @@ fn is_slip_of_word(name: &str, known: &str) -> bool {
     let letters_of = |text: &str| text.bytes().filter(u8::is_ascii_alphabetic).count();
     let letters = letters_of(name).min(letters_of(known));
     let is_longer_word = |a: &str, b: &str| a.starts_with(b) && a.len() > b.len() + 1;
-    if letters < SLIP_LETTERS || digits(name) != digits(known) || name.bytes().next() != known.bytes().next() {
+    if digits(name) != digits(known) || name.bytes().next() != known.bytes().next() {
         return false;
     }
-    if is_longer_word(name, known) || is_longer_word(known, name) {
+    if letters >= SWAPPED_LETTERS && has_neighbours_swapped(name.as_bytes(), known.as_bytes()) {
+        return true;
+    }
+    if letters < SLIP_LETTERS || is_longer_word(name, known) || is_longer_word(known, name) {
         return false;
     }
     let slips = if letters < TWO_SLIPS_LETTERS { 1 } else { 2 };
-    has_neighbours_swapped(name.as_bytes(), known.as_bytes())
-        || edits(name.as_bytes(), known.as_bytes()).is_some_and(|edits| edits <= slips)
+    edits(name.as_bytes(), known.as_bytes()).is_some_and(|edits| edits <= slips)
 }
 
 fn has_neighbours_swapped(a: &[u8], b: &[u8]) -> bool {
