@@ -4,7 +4,7 @@ use prost_reflect::{DescriptorPool, FieldDescriptor, MessageDescriptor, MethodDe
 use std::fmt::Write;
 use std::path::PathBuf;
 
-const FILES: [&str; 24] = [
+const FILES: [&str; 25] = [
     "midshift/common/v1/access.proto",
     "midshift/common/v1/common.proto",
     "midshift/common/v1/privacy.proto",
