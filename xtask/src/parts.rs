@@ -10,9 +10,6 @@ use crate::{buf, clients, deny, dist, docker, e2e, engine, quick, run};
 use anyhow::Result;
 use clap::ValueEnum;
 
-/// The test program that takes as long as all others of its part together.
-const LONGEST: &str = "simulation";
-
 /// One part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
 pub enum Part {
@@ -131,10 +128,8 @@ impl Part {
             }
             Self::Unit => round.tests(&["--lib", "--bins"], count),
             Self::Suite => {
-                let tests = workspace.tests.iter().map(String::as_str).filter(|name| *name != e2e::NAME);
-                let (longest, others): (Vec<_>, Vec<_>) = tests.partition(|name| *name == LONGEST);
-                let targets = |names: Vec<_>| names.into_iter().flat_map(|name| ["--test", name]).collect();
-                round.tests_at_once(&[targets(longest), targets(others)], count)
+                let tests = workspace.tests.iter().filter(|name| *name != e2e::NAME);
+                round.tests(&tests.flat_map(|name| ["--test", name.as_str()]).collect::<Vec<_>>(), count)
             }
             Self::E2e => {
                 let only = (!round.only.is_empty()).then(|| round.only.iter().map(String::as_str).collect());

@@ -4,7 +4,7 @@ use crate::fetch_tools::Tools;
 use crate::slowest::Slowest;
 use crate::workspace::Workspace;
 use crate::{clients, run};
-use anyhow::{Result, bail};
+use anyhow::Result;
 use std::process::Command;
 
 /// How much is asked for.
@@ -57,49 +57,19 @@ impl Round<'_> {
         Ok(())
     }
 
-    /// Runs the tests of these targets. The slowest are named.
+    /// Runs the tests of these targets.
     pub fn tests(&self, targets: &[&str], count: &mut Count) -> Result<bool> {
         self.tests_with(targets, None, count)
     }
 
-    /// The same with a variable in their environment.
-    pub fn tests_with(&self, targets: &[&str], variable: Option<(&str, &str)>, count: &mut Count) -> Result<bool> {
-        self.tests_on(threads(), targets, variable, count)
-    }
-
-    /// The same of several groups of targets, all groups at once: the last test of a program leaves no core idle.
-    pub fn tests_at_once(&self, groups: &[Vec<&str>], count: &mut Count) -> Result<bool> {
-        let share = threads() / groups.len();
-        let group = |targets: &[&str]| {
-            let mut own = Count::default();
-            self.tests_on(share, targets, None, &mut own).map(|passed| (passed, own))
-        };
-        let ended: Vec<_> = std::thread::scope(|scope| {
-            let runs: Vec<_> = groups.iter().map(|targets| scope.spawn(|| group(targets))).collect();
-            runs.into_iter().map(|run| run.join().unwrap_or_else(|_| bail!("a run of tests panicked"))).collect()
-        });
-        let mut all_passed = true;
-        for one in ended {
-            let (passed, own) = one?;
-            all_passed &= passed;
-            *count += own;
-        }
-        Ok(all_passed)
-    }
-
+    /// The same with a variable in their environment. The slowest are named.
     #[expect(clippy::disallowed_methods, reason = "seconds of the tests by the wall, for a person")]
-    fn tests_on(
-        &self,
-        threads: usize,
-        targets: &[&str],
-        variable: Option<(&str, &str)>,
-        count: &mut Count,
-    ) -> Result<bool> {
+    pub fn tests_with(&self, targets: &[&str], variable: Option<(&str, &str)>, count: &mut Count) -> Result<bool> {
         let mut command = self.workspace.cargo(&["test", "--workspace", "--no-fail-fast"]);
-        command.args(targets).env("RUST_TEST_THREADS", threads.to_string()).envs(variable);
+        command.args(targets).env("RUST_TEST_THREADS", threads().to_string()).envs(variable);
         self.surround(&mut command)?;
         let begun = std::time::Instant::now();
-        let mut slowest = Slowest::new(threads);
+        let mut slowest = Slowest::new(threads());
         let passed = run::reading(&mut command, |line| {
             count.add(line);
             slowest.add(line, begun.elapsed());
