@@ -182,6 +182,7 @@ const STANDING: &[(Table, &str)] = &[
     (Table::HoldToken, "a reason that holds a robot now; goes when it is lifted, and with its robot"),
     (Table::PlaceGrant, "one a place of a map"),
     (Table::PlaceBlock, "one a place of a map; goes with its time, or by a person"),
+    (Table::TaskType, "at most 64, names of deleted ones for a month, at most 256"),
     (Table::RobotAuthority, "one a robot; goes with it"),
     (Table::Site, "one a store"),
     (Table::AreaPolicy, "one an area of a map"),
