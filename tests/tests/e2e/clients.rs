@@ -152,6 +152,7 @@ pub fn stock_python_passes(dir: &Path, address: SocketAddr) -> anyhow::Result<()
         "common/v1/privacy.proto",
         "task/v1/task.proto",
         "task/v1/task_service.proto",
+        "task/v1/task_type.proto",
     ] {
         generate.arg(proto.join("midshift").join(file));
     }
