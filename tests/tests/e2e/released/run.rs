@@ -110,6 +110,7 @@ async fn work(line: Line) -> anyhow::Result<()> {
     line.done(&["token", "create", "orders", "--role", "operator", "--valid", "1d"])?;
     line.done(&["area", "put", "hall", "--speed-limit", "1400"])?;
     line.done(&["planner", "put", "--horizon", "20s"])?;
+    line.done(&["zone", "block", "door", "--reason", "under repair", "--for", "1d"])?;
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("look.toml");
     std::fs::write(&file, LOOK)?;
