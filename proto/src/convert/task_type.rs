@@ -11,8 +11,8 @@ use midshift_core::task::types::definition::TypeRules;
 use midshift_core::task::types::{FieldKind, StepTemplate, TaskType, TemplateKind, TypeCatalogue, TypeField};
 use serde_json::{Map, Value};
 
-/// A type that somebody puts. None if and only if a rule is broken; each is noted. `knows` answers whether the site has a
-/// waypoint.
+/// A type that somebody puts. None if and only if a rule is broken; each is noted. `knows` answers whether the site
+/// has a waypoint.
 pub fn parse_task_type(
     wire: v1::TaskType,
     at: At<'_>,
