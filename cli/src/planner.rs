@@ -1,10 +1,13 @@
-//! `midshift planner …`: live rules of the site's planner.
+//! `midshift planner …`: live rules of the site's planner, and the plans that it made.
+
+mod replay;
 
 use super::client::{Call, Change, Exit, unary};
 use super::out::Out;
 use clap::{Subcommand, ValueEnum};
 use midshift_proto::convert::ms_of;
 use midshift_proto::fleet::v1;
+use std::path::PathBuf;
 use std::time::Duration;
 
 /// Verbs of the planner.
@@ -23,6 +26,25 @@ pub enum Verb {
         rules: Rules,
         #[command(flatten)]
         change: Change,
+    },
+    /// List the newest plans: robots and tasks that were weighed, and how many pairs came of it.
+    Plans {
+        #[command(flatten)]
+        call: Call,
+    },
+    /// Show one plan: which robot has which task by it, and what that cost. With `--output json` all that it was decided by, for `planner replay`.
+    Plan {
+        #[command(flatten)]
+        call: Call,
+        /// Number of the plan, as `planner plans` lists it; unless told, the newest.
+        number: Option<u64>,
+    },
+    /// Make the decision of a plan once more, from a file and without a server. With rules, what they would have chosen instead.
+    Replay {
+        /// What `planner plan --output json` wrote; `-`: standard input.
+        file: PathBuf,
+        #[command(flatten)]
+        rules: Rules,
     },
 }
 
@@ -110,6 +132,15 @@ pub async fn run(verb: Verb, out: &Out) -> Result<(), Exit> {
             let answer = client.put_planner(unary(request)).await?.into_inner();
             show(&answer.policy.unwrap_or_default(), out)
         }
+        Verb::Plans { call } => {
+            let plans = call.fleet().await?.list_plans(unary(v1::ListPlansRequest {})).await?.into_inner();
+            replay::list(&plans, out)
+        }
+        Verb::Plan { call, number } => {
+            let plan = call.fleet().await?.get_plan(unary(v1::GetPlanRequest { number })).await?.into_inner().plan;
+            replay::show(&plan.unwrap_or_default(), out)
+        }
+        Verb::Replay { file, rules } => replay::run(&file, rules, out),
     }
 }
 

@@ -8,6 +8,7 @@
 //! 5. A test that does not end is ended with all that it started, and has failed.
 
 use crate::cores::{Cores, WINDOW};
+use crate::programs::{self, TestProgram};
 use crate::round::{Count, Round, threads};
 use crate::run;
 use crate::workspace::Workspace;
@@ -162,9 +163,9 @@ impl Permits {
 
 /// Plays them; whether all passed. Tests are added to `count`.
 pub fn play(round: &Round<'_>, options: &RoundOptions<'_>, count: &mut Count) -> Result<bool> {
-    let program = program(round.workspace)?;
+    let program = programs::named(round.programs()?, NAME)?;
     let times = Times::read(round.workspace);
-    let tests: Vec<String> = tests(round.workspace, &program)?.into_iter().filter(|name| options.plays(name)).collect();
+    let tests: Vec<String> = tests(round.workspace, program)?.into_iter().filter(|name| options.plays(name)).collect();
     ensure!(!tests.is_empty(), "no end-to-end test has such a name");
     let folder = round.workspace.target.join("e2e");
     std::fs::create_dir_all(&folder).with_context(|| format!("creating {}", folder.display()))?;
@@ -183,7 +184,7 @@ pub fn play(round: &Round<'_>, options: &RoundOptions<'_>, count: &mut Count) ->
             queue,
             permits,
             || cores.are_idle(),
-            |unit, slot| round.one(unit, options, &program, &folder, ports(slot, permits.idle)),
+            |unit, slot| round.one(unit, options, program, &folder, ports(slot, permits.idle)),
         );
         stop.store(true, Ordering::Relaxed);
         played
@@ -276,11 +277,11 @@ impl Round<'_> {
         &self,
         unit: &Unit,
         options: &RoundOptions<'_>,
-        program: &Path,
+        program: &TestProgram,
         folder: &Path,
         ports: Range<usize>,
     ) -> Result<(bool, Count)> {
-        let mut command = command(self.workspace, program);
+        let mut command = program.command(self.workspace);
         command.arg(&unit.name);
         if TOGETHER.contains(&unit.name.as_str()) {
             command.env("RUST_TEST_THREADS", unit.permits.to_string());
@@ -311,29 +312,9 @@ fn ended(command: &mut Command, log: &Path) -> Result<(bool, Count)> {
     Ok((passed, count))
 }
 
-/// The test program, where `cargo test` would run it.
-fn command(workspace: &Workspace, program: &Path) -> Command {
-    let mut command = workspace.command(program);
-    command.current_dir(workspace.root.join("tests"));
-    command
-}
-
-/// Builds the test program; where it is.
-fn program(workspace: &Workspace) -> Result<PathBuf> {
-    // With all tests, as they were built: of one alone the crates below have other features, and are compiled once more.
-    let how = ["test", "--workspace", "--tests", "--no-run", "--message-format", "json-render-diagnostics"];
-    let output = workspace.cargo(&how).stderr(std::process::Stdio::inherit()).output().context("running cargo")?;
-    ensure!(output.status.success(), "the end-to-end tests do not build");
-    let lines = String::from_utf8_lossy(&output.stdout).into_owned();
-    let built = lines.lines().filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
-    let mut built =
-        built.filter(|one| one["target"]["name"] == NAME).filter_map(|one| Some(one["executable"].as_str()?.into()));
-    built.next().context("cargo names no program of the end-to-end tests")
-}
-
 /// Names of its tests.
-fn tests(workspace: &Workspace, program: &Path) -> Result<Vec<String>> {
-    let output = command(workspace, program).args(["--list", "--format", "terse"]).output().context("listing tests")?;
+fn tests(workspace: &Workspace, program: &TestProgram) -> Result<Vec<String>> {
+    let output = program.command(workspace).args(["--list", "--format", "terse"]).output().context("listing tests")?;
     if !output.status.success() {
         bail!("listing tests: {}", String::from_utf8_lossy(&output.stderr).trim());
     }
@@ -484,14 +465,14 @@ mod tests {
     #[test]
     fn what_passed_is_read_off_what_a_program_says_and_one_that_counts_nothing_has_failed() {
         let workspace = Workspace::find().unwrap();
-        let program = std::env::current_exe().unwrap();
+        let program = TestProgram::this();
         let log = std::env::temp_dir().join(format!("xtask-e2e-{}.log", std::process::id()));
         let one =
             "e2e::tests::the_longest_of_the_last_run_is_started_first_or_of_any_run_where_there_was_none".to_owned();
         assert!(tests(&workspace, &program).unwrap().contains(&one));
-        let passed = ended(command(&workspace, &program).args([&one, "--exact"]), &log).unwrap();
+        let passed = ended(program.command(&workspace).args([&one, "--exact"]), &log).unwrap();
         assert_eq!(passed, (true, Count { passed: 1, failed: 0, ignored: 0 }));
-        let failed = |words: &str| ended(command(&workspace, Path::new("sh")).args(["-c", words]), &log).unwrap();
+        let failed = |words: &str| ended(workspace.command("sh").args(["-c", words]), &log).unwrap();
         let one_failed = (false, Count { passed: 0, failed: 1, ignored: 0 });
         assert_eq!([failed("exit 3"), failed("true")], [one_failed, one_failed]);
         std::fs::remove_file(log).unwrap();

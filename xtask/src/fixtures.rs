@@ -5,6 +5,7 @@
 
 use crate::e2e::{self, RoundOptions};
 use crate::fetch_tools::Tools;
+use crate::programs::{self, Choice};
 use crate::round::{Count, Round, Scope};
 use crate::workspace::Workspace;
 use crate::{buf, parts, run};
@@ -36,13 +37,14 @@ fn record(workspace: &Workspace, version: &str) -> Result<bool> {
     let tools = Tools::find(workspace)?;
     ensure!(parts::build(workspace)?, "the programs do not build");
     let variable = (RECORD, part.to_str().context("the folder's name is text")?);
-    let (round, mut count) =
-        (Round { workspace, tools: Some(tools), scope: Scope::Daily, only: &[] }, Count::default());
+    let (mut round, mut count) = (Round::new(workspace, Scope::Daily, &[]), Count::default());
+    round.tools = Some(tools);
     let only = Some(vec!["released::recorded::a_run_on_"]);
     let run = e2e::play(&round, &RoundOptions { only, variable: Some(variable), is_loaded: false }, &mut count)?;
     ensure!(run, "the run failed");
-    let shift = ["--test", "simulation", "--", "frames::a_shift_says_"];
-    ensure!(round.tests_with(&shift, Some(variable), &mut count)?, "the shift failed");
+    let simulation = programs::named(round.programs()?, "simulation")?;
+    let shift = Choice { filter: Some("frames::a_shift_says_"), variable: Some(variable) };
+    ensure!(round.play(&[simulation], shift, &mut count)?, "the shift failed");
     std::fs::copy(workspace.root.join("tests/golden").join(KEYS), part.join(KEYS)).context("copying the names")?;
     let Some(tools) = &round.tools else { return Ok(false) };
     ensure!(buf::describe(workspace, tools, &part)?, "the descriptors were not written");

@@ -17,6 +17,7 @@ mod fixtures;
 mod go;
 mod images;
 mod parts;
+mod programs;
 mod quick;
 mod round;
 mod run;

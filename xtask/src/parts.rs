@@ -3,6 +3,7 @@
 //! Invariant: no part is skipped; a part that cannot run fails. All cargo calls select the whole workspace, so that features
 //! are the same in each and nothing is compiled twice.
 
+use crate::programs::{Choice, TestProgram};
 use crate::round::{Count, Round, Scope};
 use crate::stack::{self, Which};
 use crate::workspace::Workspace;
@@ -126,10 +127,10 @@ impl Part {
                 let Some(tools) = tools else { return Ok(false) };
                 clients::build(workspace, &tools.python)
             }
-            Self::Unit => round.tests(&["--lib", "--bins"], count),
+            Self::Unit => round.play(&chosen(round, |program| program.is_inside)?, Choice::default(), count),
             Self::Suite => {
-                let tests = workspace.tests.iter().filter(|name| *name != e2e::NAME);
-                round.tests(&tests.flat_map(|name| ["--test", name.as_str()]).collect::<Vec<_>>(), count)
+                let programs = chosen(round, |program| !program.is_inside && program.name != e2e::NAME)?;
+                round.play(&programs, Choice::default(), count)
             }
             Self::E2e => {
                 let only = (!round.only.is_empty()).then(|| round.only.iter().map(String::as_str).collect());
@@ -140,13 +141,23 @@ impl Part {
             Self::Loaded => {
                 e2e::play(round, &e2e::RoundOptions { is_loaded: true, ..e2e::RoundOptions::default() }, count)
             }
-            Self::Doc => round.tests(&["--doc"], count),
+            Self::Doc => {
+                let mut command = workspace.cargo(&["test", "--workspace", "--no-fail-fast", "--doc"]);
+                run::reading(&mut command, |line| {
+                    count.add(line);
+                    run::print(line);
+                })
+            }
             Self::Dist => count.one(dist::test(workspace)),
             Self::Stack => count.one(stack::test(workspace, &Which::split(), Some(workspace.midshift()))),
             Self::Compose => count.one(docker::test(workspace, &workspace.midshift())),
             Self::Deny => count.one(deny::check(workspace)),
         }
     }
+}
+
+fn chosen<'r>(round: &'r Round<'_>, which: impl Fn(&TestProgram) -> bool) -> Result<Vec<&'r TestProgram>> {
+    Ok(round.programs()?.iter().filter(|program| which(program)).collect())
 }
 
 /// Builds the programs, the example of a robot's too. Tests as well: a build without them has other features, and everything would be compiled twice.

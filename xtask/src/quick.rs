@@ -3,6 +3,7 @@
 //! Invariant: it proves nothing that the suite does not prove again.
 
 use crate::e2e::{self, RoundOptions};
+use crate::programs::{self, Choice};
 use crate::round::{Count, Round};
 use anyhow::Result;
 
@@ -19,9 +20,10 @@ const HANDFUL: [&str; 5] = [
 
 /// Runs it; whether all passed. Nothing is left out after a test that failed.
 pub fn run(round: &Round<'_>, count: &mut Count) -> Result<bool> {
-    let pages = round.tests(&["--test", "architecture", "--test", "model"], count)?;
-    let simulation = ["--test", "simulation", "--", "many_seeds_keep_every_law"];
-    let shifts = round.tests_with(&simulation, Some(SEEDS), count)?;
+    let named = |name| programs::named(round.programs()?, name);
+    let pages = round.play(&[named("architecture")?, named("model")?], Choice::default(), count)?;
+    let seeds = Choice { filter: Some("many_seeds_keep_every_law"), variable: Some(SEEDS) };
+    let shifts = round.play(&[named("simulation")?], seeds, count)?;
     let programs = e2e::play(round, &RoundOptions { only: Some(HANDFUL.to_vec()), ..RoundOptions::default() }, count)?;
     Ok(pages && shifts && programs)
 }

@@ -1,11 +1,12 @@
 //! What parts of the suite are run with, and what their tests added up to.
 
+use crate::clients;
 use crate::fetch_tools::Tools;
-use crate::slowest::Slowest;
+use crate::programs::TestProgram;
 use crate::workspace::Workspace;
-use crate::{clients, run};
-use anyhow::Result;
+use anyhow::{Context, Result};
 use std::process::Command;
+use std::sync::OnceLock;
 
 /// How much is asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,6 +27,8 @@ pub struct Round<'w> {
     pub scope: Scope,
     /// Beginnings of the names of those end-to-end tests that are asked for; none: all.
     pub only: &'w [String],
+    /// Test programs, once they are built.
+    built: OnceLock<Vec<TestProgram>>,
 }
 
 /// What cargo's closing lines added up to.
@@ -44,7 +47,12 @@ pub fn threads() -> usize {
     2 * std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
 }
 
-impl Round<'_> {
+impl<'w> Round<'w> {
+    /// Nothing built yet.
+    pub fn new(workspace: &'w Workspace, scope: Scope, only: &'w [String]) -> Self {
+        Self { workspace, tools: None, scope, only, built: OnceLock::new() }
+    }
+
     /// Tells tests where programs, tools and clients are.
     pub fn surround(&self, command: &mut Command) -> Result<()> {
         // What failed is said in a line; a hundred lines of where it was hide it.
@@ -57,25 +65,13 @@ impl Round<'_> {
         Ok(())
     }
 
-    /// Runs the tests of these targets.
-    pub fn tests(&self, targets: &[&str], count: &mut Count) -> Result<bool> {
-        self.tests_with(targets, None, count)
-    }
-
-    /// The same with a variable in their environment. The slowest are named.
-    #[expect(clippy::disallowed_methods, reason = "seconds of the tests by the wall, for a person")]
-    pub fn tests_with(&self, targets: &[&str], variable: Option<(&str, &str)>, count: &mut Count) -> Result<bool> {
-        let mut command = self.workspace.cargo(&["test", "--workspace", "--no-fail-fast"]);
-        command.args(targets).env("RUST_TEST_THREADS", threads().to_string()).envs(variable);
-        self.surround(&mut command)?;
-        let begun = std::time::Instant::now();
-        let mut slowest = Slowest::new(threads());
-        let passed = run::reading(&mut command, |line| {
-            count.add(line);
-            slowest.add(line, begun.elapsed());
-        });
-        run::say_slowest(&slowest.list());
-        passed
+    /// Test programs of the workspace, built at the first call.
+    pub fn programs(&self) -> Result<&[TestProgram]> {
+        if self.built.get().is_none() {
+            // Who was first has built the same.
+            let _ = self.built.set(TestProgram::build_all(self.workspace)?);
+        }
+        self.built.get().map(Vec::as_slice).context("they were built")
     }
 }
 

@@ -36,8 +36,7 @@ pub fn succeeds(command: &mut Command) -> Result<bool> {
     Ok(command.status().with_context(|| format!("running {}", shown(command)))?.success())
 }
 
-/// Runs to the end, passing stdout on line by line and showing each line to `read`; whether it succeeded. After three hours it is ended, with
-/// all that it started.
+/// Runs to the end, giving stdout to `read` line by line; whether it succeeded. After three hours it is ended, with all that it started.
 pub fn reading(command: &mut Command, mut read: impl FnMut(&str)) -> Result<bool> {
     tell_person(&format!("$ {}", shown(command)));
     let mut child = command.stdout(Stdio::piped()).spawn().with_context(|| format!("running {}", shown(command)))?;
@@ -54,9 +53,7 @@ pub fn reading(command: &mut Command, mut read: impl FnMut(&str)) -> Result<bool
     });
     for line in BufReader::new(stdout).split(b'\n') {
         let line = line.context("reading output")?;
-        let line = String::from_utf8_lossy(&line);
-        read(&line);
-        print(&line);
+        read(&String::from_utf8_lossy(&line));
     }
     let succeeded = child.wait().context("waiting")?.success();
     drop(over);

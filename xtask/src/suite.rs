@@ -54,7 +54,7 @@ pub fn test(workspace: &Workspace, args: &TestArgs) -> Result<bool> {
     }
     ensure!(args.only.is_empty() || parts.contains(&Part::E2e), "--only chooses tests of the part `e2e`: name it too");
     let (mut lines, mut count) = (Vec::new(), Count::default());
-    let mut round = Round { workspace, tools: None, scope, only: &args.only };
+    let mut round = Round::new(workspace, scope, &args.only);
     if parts.iter().any(|part| part.needs_tools()) {
         let (found, took) = timed(|| if args.install { Tools::install(workspace) } else { Tools::find(workspace) });
         round.tools = Some(found?);

@@ -1,4 +1,4 @@
-//! Long sweeps and golden files: calls of `cargo test` with an environment variable that the tests read.
+//! Long sweeps and golden files: test programs with an environment variable that the tests read.
 //!
 //! Invariant: a sweep that ran no test fails. `MIDSHIFT_SEED` is read by the test that kills programs, by stories and by
 //! nights, `MIDSHIFT_STORY` by stories, `MIDSHIFT_NIGHT` by nights, `MIDSHIFT_SEEDS` and `MIDSHIFT_SEED_FROM` by the
@@ -8,6 +8,7 @@
 
 use crate::fetch_tools::Tools;
 use crate::parts;
+use crate::programs::{self, TestProgram};
 use crate::round::Count;
 use crate::run;
 use crate::workspace::Workspace;
@@ -129,7 +130,7 @@ impl Sweep {
             Self::Stops => runs.seeded("simulation", "stopped::in_cuts_and_kills", from, seeds),
             Self::Skew => runs.seeded("simulation", "skew::", from, seeds),
             Self::Split => runs.split(seeds),
-            Self::OldSites => runs.counted(runs.test("e2e", "old_site::").env("MIDSHIFT_OLD_TASKS", OLD_TASKS)),
+            Self::OldSites => runs.counted(runs.test("e2e", "old_site::")?.env("MIDSHIFT_OLD_TASKS", OLD_TASKS)),
             Self::Soak => runs.soak(),
             Self::Updates => {
                 let drawn = runs.seeded("agent", "drawn_cuts::", from, seeds)?;
@@ -179,7 +180,7 @@ fn soak_hours(sweeps: &[Sweep], hours: Option<f64>) -> Result<f64> {
     Ok(hours)
 }
 
-/// Calls of `cargo test`, and what their tests added up to.
+/// Runs of test programs, and what their tests added up to.
 struct Runs<'w> {
     workspace: &'w Workspace,
     count: Count,
@@ -189,25 +190,28 @@ struct Runs<'w> {
 
 impl Runs<'_> {
     /// The workspace's one test program of this name.
-    fn test(&self, target: &str, filter: &str) -> Command {
-        self.workspace.cargo(&["test", "--workspace", "--test", target, "--", filter, "--nocapture"])
+    fn test(&self, target: &str, filter: &str) -> Result<Command> {
+        let programs = TestProgram::build_all(self.workspace)?;
+        let mut command = programs::named(&programs, target)?.command(self.workspace);
+        command.args([filter, "--nocapture"]);
+        Ok(command)
     }
 
     /// Tests that cut a process off at its calls: at every one.
     fn every_site(&mut self, target: &str, filter: &str) -> Result<bool> {
-        self.counted(self.test(target, filter).env("MIDSHIFT_SITES", "all"))
+        self.counted(self.test(target, filter)?.env("MIDSHIFT_SITES", "all"))
     }
 
     /// Tests that play as many seeds as their environment says.
     fn seeded(&mut self, target: &str, filter: &str, from: u64, seeds: u64) -> Result<bool> {
-        let mut command = self.test(target, filter);
+        let mut command = self.test(target, filter)?;
         self.counted(command.env("MIDSHIFT_SEED_FROM", from.to_string()).env("MIDSHIFT_SEEDS", seeds.to_string()))
     }
 
     /// Tests of real programs, which are built.
     fn programs(&self, filter: &str) -> Result<Command> {
         ensure!(parts::build(self.workspace)?, "the programs do not build");
-        let mut command = self.test("e2e", filter);
+        let mut command = self.test("e2e", filter)?;
         self.workspace.export_programs(&mut command)?;
         Ok(command)
     }
@@ -253,7 +257,10 @@ impl Runs<'_> {
 
     fn counted(&mut self, command: &mut Command) -> Result<bool> {
         let mut count = Count::default();
-        let succeeded = run::reading(command, |line| count.add(line))?;
+        let succeeded = run::reading(command, |line| {
+            count.add(line);
+            run::print(line);
+        })?;
         self.count += count;
         run::print(&format!("{} passed, {} failed", count.passed, count.failed));
         ensure!(!succeeded || count.passed > 0, "no test matched");

@@ -20,8 +20,6 @@ pub struct Workspace {
     pub root: PathBuf,
     /// Cargo's target directory.
     pub target: PathBuf,
-    /// Names of the integration tests' programs.
-    pub tests: Vec<String>,
     /// The version that all crates share.
     version: Option<String>,
     /// This program, as it was called: a build of everything may put a new one in its place, and then the system says that it is deleted.
@@ -43,12 +41,7 @@ impl Workspace {
         let ours = |package: &&serde_json::Value| package["name"] == "midshift";
         let midshift = metadata["packages"].as_array().and_then(|all| all.iter().find(ours));
         let version = midshift.and_then(|package| package["version"].as_str()).map(str::to_owned);
-        let packages = metadata["packages"].as_array().into_iter().flatten();
-        let targets = packages.filter_map(|package| package["targets"].as_array()).flatten();
-        let tests = targets.filter(|target| target["kind"][0] == "test").filter_map(|target| target["name"].as_str());
-        let mut tests: Vec<String> = tests.map(str::to_owned).collect();
-        tests.sort();
-        Ok(Self { root: path("workspace_root")?, target: path("target_directory")?, tests, version, this })
+        Ok(Self { root: path("workspace_root")?, target: path("target_directory")?, version, this })
     }
 
     /// The version of midshift at hand.

@@ -147,12 +147,13 @@ pub fn cycle(view: &mut FleetProjection, now: Now, board: &Board, pace: Pace, pl
     plan.slice.renew();
     drain::plan(view, board, now, plan);
     plan.slice.renew();
-    readiness::settle(view, now, plan);
+    let moved = readiness::settle(view, now, plan);
     if pace == Pace::Sweep {
         readiness::tell_backlog(view, now, plan);
     }
     plan.slice.renew();
     let idle = assign::plan(view, board, now, &heard, plan);
+    readiness::reckon_starts(view, now, &moved);
     errands::plan(view, board, now, idle, plan);
     plan.slice.renew();
     write_down(view, now, board, &desired::Releases::default(), plan);

@@ -43,6 +43,7 @@ codes! {
         => "`midshift robot ls` lists those that are known.";
     IncidentNotFound = "INCIDENT_NOT_FOUND", "No open incident has this id." => "`midshift incident ls` lists them.";
     AreaNotFound = "AREA_NOT_FOUND", "The site has no such area." => "Its areas are named in the site file.";
+    PlanNotFound = "PLAN_NOT_FOUND", "The process that plans remembers no such plan." => "`midshift planner plans` lists those that it remembers.";
     TaskTypeNotFound = "TASK_TYPE_NOT_FOUND", "The site has no such task type registered."
         => "`midshift task type ls` lists those that there are.";
     TaskTypesFull = "TASK_TYPES_FULL", "The site has as many task types as it may, 64, or names of types, 256 with those deleted within a month."

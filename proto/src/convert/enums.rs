@@ -1,6 +1,7 @@
 //! Enums of core and their numbers on the wire.
 
 use crate::{common, fleet, link, ota, stop, task, telemetry};
+use midshift_core::fleet::projection::plans::Free;
 use midshift_core::fleet::rows::{DrainState, HolderState};
 use midshift_core::planner_policy::AssignmentPolicy;
 use midshift_core::presence::Presence;
@@ -11,6 +12,7 @@ use midshift_core::rollout::rows::{Ending, Outcome, Pause, Phase as RolloutPhase
 use midshift_core::rollout::spec::{AbortScope, SmallWave, SmallWaveFailure};
 use midshift_core::step::Effect;
 use midshift_core::stop::ladder::Stage;
+use midshift_core::task::spec::Class;
 use midshift_core::task::state::Errand;
 use midshift_core::task::{AfterStopping, AttemptPhase, Phase, Resolution};
 use midshift_core::update::{Goal, UpdateState};
@@ -78,6 +80,8 @@ wire_enums! {
     }
     Presence = telemetry::v1::Presence { Online = Online, Suspect = Suspect, Offline = Offline }
     AssignmentPolicy = fleet::v1::AssignmentPolicy { FifoNearest = FifoNearest, Rolling = Rolling }
+    Class = fleet::v1::TaskClass { Urgent = Urgent, Normal = Normal, Background = Background }
+    Free = fleet::v1::RobotFree { Now = Now, AfterErrand = AfterErrand, Soon = Soon }
     Duty = fleet::v1::Duty { InWork = InWork, Cordoned = Cordoned, BrokenOff = BrokenOff, Retired = Retired }
     RolloutPhase = ota::v1::RolloutPhase {
         Draft = Draft, Validated = Validated, Approved = Approved, Prefetching = Prefetching, Applying = Applying, Soaking = Soaking, Gate = Gate,

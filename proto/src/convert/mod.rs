@@ -6,6 +6,7 @@
 pub mod common;
 mod enums;
 pub mod fleet;
+pub mod plan;
 mod reading;
 pub mod robot;
 pub mod sample;

@@ -38,6 +38,8 @@ const FATES: &[(&str, Fate)] = &[
     ("fleet.v1.PlaceHolderState", Fate::Shown),
     ("fleet.v1.PlaceKind", Fate::Shown),
     ("fleet.v1.PlaceRule", Fate::Shown),
+    ("fleet.v1.RobotFree", Fate::Shown),
+    ("fleet.v1.TaskClass", Fate::Shown),
     ("link.v1.CloseCode", Fate::NotTaken),
     ("link.v1.HardwareStop", Fate::NotTaken),
     ("link.v1.Lane", Fate::NotTaken),

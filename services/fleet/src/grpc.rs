@@ -15,6 +15,7 @@ use midshift_core::time::Utc;
 use midshift_core::unknown_rows;
 use midshift_proto::access::caller;
 use midshift_proto::convert::fleet::{encode_planner, encode_policy, parse_planner};
+use midshift_proto::convert::plan::{encode_plan, encode_summary};
 use midshift_proto::convert::task::revision_of;
 use midshift_proto::convert::{At, parse_ms, timestamp};
 use midshift_proto::fleet::v1;
@@ -217,6 +218,20 @@ impl FleetService {
         bad.finish()?;
         self.act(Command::PutPlanner(policy.ok_or_else(internal)?), by, seen, r.validate_only, request_id).await?;
         Ok(v1::PutPlannerResponse { policy: Some(self.planner(by).await?) })
+    }
+
+    async fn plans(&self, by: &Caller) -> Result<v1::ListPlansResponse, Refusal> {
+        by.authorize(Permission::Read, [])?;
+        let plans = self.query_projection(|view, _, _| view.plans.iter().cloned().collect::<Vec<_>>()).await?;
+        Ok(v1::ListPlansResponse { plans: plans.iter().map(|plan| encode_summary(plan)).collect() })
+    }
+
+    async fn plan(&self, r: v1::GetPlanRequest, by: &Caller) -> Result<v1::GetPlanResponse, Refusal> {
+        by.authorize(Permission::Read, [])?;
+        let found = self.query_projection(move |view, _, _| view.plans.get(r.number).cloned()).await?;
+        let asked = || r.number.map_or_else(|| "the newest".to_owned(), |number| number.to_string());
+        let plan = found.ok_or_else(|| not_found(Code::PlanNotFound, asked()))?;
+        Ok(v1::GetPlanResponse { plan: Some(encode_plan(&plan)) })
     }
 
     async fn places(&self, r: v1::ListPlacesRequest, by: &Caller) -> Result<v1::ListPlacesResponse, Refusal> {
@@ -504,6 +519,14 @@ impl Face for FleetService {
     async fn put_planner(&self, r: Request<v1::PutPlannerRequest>) -> Result<Response<v1::PutPlannerResponse>, Status> {
         let by = caller(&r);
         answer(self.change_planner(r.into_inner(), &by).await)
+    }
+    async fn list_plans(&self, r: Request<v1::ListPlansRequest>) -> Result<Response<v1::ListPlansResponse>, Status> {
+        let by = caller(&r);
+        answer(self.plans(&by).await)
+    }
+    async fn get_plan(&self, r: Request<v1::GetPlanRequest>) -> Result<Response<v1::GetPlanResponse>, Status> {
+        let by = caller(&r);
+        answer(self.plan(r.into_inner(), &by).await)
     }
     async fn list_places(&self, r: Request<v1::ListPlacesRequest>) -> Result<Response<v1::ListPlacesResponse>, Status> {
         let by = caller(&r);

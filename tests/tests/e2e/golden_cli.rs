@@ -454,6 +454,9 @@ async fn golden_transcript_of_the_command_line() -> anyhow::Result<()> {
     t.note(&["planner", "put", "--horizon", "20s", "--ageing", "0", "-o", "json"])?;
     t.note(&["planner", "put", "--horizon", "2m", "--urgent-weight", "0"])?;
     t.note(&["planner", "put", "--policy", "fifo-nearest", "--dry-run", "-o", "name"])?;
+    t.note(&["planner", "plans"])?;
+    t.note(&["planner", "plan", "7"])?;
+    t.note(&["planner", "replay", "no-such-plan.json"])?;
 
     // Tasks, while the robot is out of dispatch.
     let submit = ["task", "submit", "--from", "A", "--to", "B", "--sku", "SKU-1", "--task-id", "TASK-1"];

@@ -16,21 +16,22 @@ use crate::task::Event;
 use crate::time::{Now, Utc};
 
 /// Brings the queue up to now: notes since when a task is ready, arms what counts from then, and gives to a person what can never be ready.
-pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut Plan) {
+/// Gives back tasks that moved in the queue.
+pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut Plan) -> Vec<TaskId> {
     advance(view, now.utc);
     place_breaker::choose_probes(view, now.utc);
     coalesce(view, now, plan);
+    let mut moved = Vec::new();
     for task_id in view.queue.failed.iter().take(TASKS_PER_TURN).cloned().collect::<Vec<_>>() {
         let why = view.queue.waiting.get(&task_id).and_then(|w| w.wait.reason());
         if plan.is_cut() {
-            return;
+            return moved;
         }
         ask_person(view, now, &task_id, why.as_ref(), plan);
     }
-    let mut moved = Vec::new();
     for task_id in view.queue.moved.iter().take(TASKS_PER_TURN).cloned().collect::<Vec<_>>() {
         if plan.is_cut() {
-            return;
+            return moved;
         }
         let is_unmarked = view.queue.waiting.get(&task_id).is_some_and(|w| w.wait == Wait::Mark);
         plan.decide(view, now, "fleet", |tx| {
@@ -44,15 +45,16 @@ pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut 
         view.queue.moved.remove(&task_id);
         moved.push(task_id);
     }
-    reckon_starts(view, now, &moved);
     check_robots(view, now, plan);
+    moved
 }
 
-/// Notes where some of the tasks stand that began to be ready, and some that are so for long.
-fn reckon_starts(view: &mut FleetProjection, now: Now, moved: &[TaskId]) {
-    for task_id in view.starts.pick_tasks(moved.iter(), now.utc) {
-        match view.queue.position(&task_id).zip(view.queue.rank(&task_id)) {
-            Some((position, rank)) => view.starts.reckon_task(&task_id, position, rank.since, now.utc),
+/// Notes what some tasks have before them that began to be ready and that the plan gave to nobody, and some that are ready for long.
+pub(in crate::fleet) fn reckon_starts(view: &mut FleetProjection, now: Now, moved: &[TaskId]) {
+    let left: Vec<&TaskId> = moved.iter().filter(|task_id| view.queue.rank(task_id).is_some()).collect();
+    for task_id in view.starts.pick_tasks(left.into_iter(), now.utc) {
+        match view.start_outlook(&task_id) {
+            Some(outlook) => view.starts.reckon_task(&task_id, &outlook, now.utc),
             None => view.starts.forget_task(&task_id),
         }
     }

@@ -5,6 +5,7 @@
 use super::broken_steps::{BrokenSteps, StepMemory};
 use super::chosen::Chosen;
 use super::memory::{Agenda, AttachedTime, Lasting, Meant, UnansweredOffers, Unexplained, Waiting};
+use super::plans::Plans;
 use super::queue::{Ended, Queue};
 use super::ready::ReadyTasks;
 use super::refused::Refused;
@@ -13,7 +14,7 @@ use super::rows::{
     RobotControl, RobotCounter, RobotHolder, ServiceClock, SiteRow, Timer,
 };
 use super::same_key::SameKey;
-use super::start_estimates::Starts;
+use super::start_estimates::{Outlook, Starts};
 use crate::desired_state::{DesiredPolicy, DesiredWork};
 use crate::drain_request::{DrainRelease, DrainRequest};
 use crate::energy::RobotEnergy;
@@ -116,6 +117,8 @@ projection! {
         meant: Meant = Meant::default();
         /// Why tasks went to the robots that they went to.
         chosen: Chosen = Chosen::default();
+        /// The newest plans, with all that they were decided by.
+        plans: Plans = Plans::default();
         /// How soon ready tasks got a robot lately.
         starts: Starts = Starts::default();
         /// Which robots failed a step at a place lately, and which task tries it again.
@@ -268,6 +271,14 @@ impl FleetProjection {
     /// What the robot's work costs, as far as its attempts say; else as the model says.
     pub fn energy_of(&self, robot: &RobotId) -> &RobotEnergy {
         self.energy.get(robot).unwrap_or(&RobotEnergy::MODEL)
+    }
+
+    /// What a ready task has before it until it gets a robot. None: it is not ready.
+    pub fn start_outlook(&self, task_id: &TaskId) -> Option<Outlook> {
+        let (position, rank) = self.queue.position(task_id).zip(self.queue.rank(task_id))?;
+        let meant = self.meant.get(task_id).filter(|meant| self.held_by(&meant.robot_id).is_some());
+        let meant_free = meant.map(|meant| meant.free);
+        Some(Outlook { position, since: rank.since, meant_free })
     }
 
     /// Work done by the robot, by version of its software.

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::fleet::assignment::errands;
+use crate::fleet::assignment::rolling::matching;
 use crate::fleet::explain;
 use crate::fleet::projection::memory::Meant;
 use crate::rows::Table;
@@ -69,6 +70,25 @@ fn a_choice_is_told_from_the_costs_that_decided_with_what_the_next_robot_took() 
     let next: Vec<_> =
         choice.next.iter().map(|n| (n.robot_id.as_str(), n.cost.sum(), n.took.as_ref().map(TaskId::as_str))).collect();
     assert_eq!(next, [("right", 40_000_000, Some("second"))], "nearer, and worth more elsewhere");
+}
+
+#[test]
+fn a_plan_is_remembered_with_all_that_it_was_decided_by_and_comes_out_the_same_again() {
+    let mut rig = line();
+    rig.robot("left", "c0");
+    rig.robot("right", "c60");
+    rig.submit("first", visits(&[40]));
+    rig.submit("second", visits(&[100]));
+    rig.cycle(Pace::Wake);
+    let plan = rig.view.plans.get(None).expect("a plan").clone();
+    assert_eq!((plan.number, plan.at, &plan.policy), (1, rig.now.utc, &rig.view.planner()));
+    let robots: Vec<&str> = plan.weighed.robots.iter().map(|robot| robot.robot_id.as_str()).collect();
+    let tasks: Vec<&str> = plan.weighed.tasks.iter().map(|task| task.task_id.as_str()).collect();
+    let made: Vec<_> = plan.made.iter().map(|(robot, task)| (robots[*robot], tasks[*task])).collect();
+    assert_eq!((made, plan.weighed.pairs.len()), (vec![("left", "first"), ("right", "second")], 4));
+    assert_eq!(matching::choose_pairs(&plan.policy, plan.at, &plan.weighed), plan.made);
+    rig.cycle(Pace::Wake);
+    assert_eq!(rig.view.plans.iter().count(), 1, "nothing was decided since");
 }
 
 #[test]

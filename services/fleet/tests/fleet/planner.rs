@@ -3,6 +3,7 @@
 use crate::harness::World;
 use crate::unknown::rewritten;
 use midshift_core::audit::{AuditRow, DONE};
+use midshift_core::fleet::assignment::rolling::matching;
 use midshift_core::identity::{Caller, TokenId};
 use midshift_core::planner_policy::{AssignmentPolicy, PlannerPolicy};
 use midshift_core::reason::Code as Why;
@@ -13,6 +14,7 @@ use midshift_fleet::FleetService;
 use midshift_proto::access::local;
 use midshift_proto::convert::duration;
 use midshift_proto::convert::fleet::encode_planner;
+use midshift_proto::convert::plan::parse_plan;
 use midshift_proto::fleet::v1;
 use midshift_proto::fleet::v1::fleet_service_server::FleetService as Face;
 use midshift_proto::refusal_of;
@@ -197,5 +199,34 @@ async fn rules_of_the_planner_of_a_newer_version_are_left_as_they_are_and_robots
     rewritten(&w, Table::PlannerPolicy, &id, ("\"by_auction\"", "\"rolling\""), None).await;
     w.pass(1).await;
     assert_eq!(followed(&w.fleet).await, put_before);
+    w.lawful().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_plan_is_shown_with_all_that_it_was_decided_by_to_who_may_read_the_site() {
+    let mut w = World::on(CORRIDOR).await;
+    let list = |w: &World| {
+        let fleet = w.fleet.clone();
+        async move { fleet.list_plans(local(v1::ListPlansRequest {})).await.expect("plans").into_inner().plans }
+    };
+    assert_eq!(list(&w).await, []);
+    let none = w.fleet.get_plan(local(v1::GetPlanRequest { number: None })).await.expect_err("none was made");
+    assert_eq!((none.code(), refusal_of(&none).code), (Code::NotFound, Some(Why::PlanNotFound)));
+    w.robot("r1", "park-a").await;
+    w.submit("T1", "A", "B").await;
+    w.until_phase("T1", Phase::Assigned).await;
+    let plans = list(&w).await;
+    let first = plans.last().expect("a plan");
+    assert_eq!((first.number, first.robots, first.tasks, first.pairs, first.decisions), (1, 1, 1, 1, 1));
+    let plan = w.fleet.get_plan(local(v1::GetPlanRequest { number: Some(1) })).await.expect("it").into_inner().plan;
+    let plan = plan.expect("always set");
+    assert_eq!((plan.robots[0].robot_id.as_str(), plan.tasks[0].task_id.as_str()), ("r1", "T1"));
+    let read = parse_plan(plan).expect("as it was shown");
+    assert_eq!(matching::choose_pairs(&read.policy, read.at, &read.weighed), read.made);
+    let area = format!("viewer@{}", w.site.areas()[0].area_id);
+    let unseen = w.fleet.list_plans(anna(&[&area], v1::ListPlansRequest {})).await.expect_err("not hers");
+    let unread = w.fleet.get_plan(anna(&[&area], v1::GetPlanRequest { number: None })).await.expect_err("not hers");
+    assert_eq!([unseen.code(), unread.code()], [Code::PermissionDenied; 2]);
+    assert!(w.fleet.get_plan(anna(&["viewer"], v1::GetPlanRequest { number: Some(1) })).await.is_ok());
     w.lawful().await;
 }

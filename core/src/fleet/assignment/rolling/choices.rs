@@ -4,19 +4,19 @@
 //! Invariant: each pair could be made as far as robot and task alone say; what else stands against it is asked of the
 //! few that are chosen.
 
-use super::cost::{self, Urgency};
-use super::robots::{Free, ROBOTS_MAX, Robot};
+use super::cost;
+use super::robots::{ROBOTS_MAX, Robot};
 use crate::fleet::assignment::demand::Demand;
 use crate::fleet::assignment::filters;
 use crate::fleet::decision::slice::Slice;
 use crate::fleet::projection::liveness::Board;
+use crate::fleet::projection::plans::{Free, Weighed, WeighedPair, WeighedRobot, WeighedTask};
 use crate::fleet::projection::queue::Rank;
 use crate::fleet::projection::ready::{Need, ReadyTask};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::eligibility;
 use crate::fleet::traffic::routing;
 use crate::ids::{RobotId, TaskId};
-use crate::planner_policy::PlannerPolicy;
 use crate::site::WaypointIx;
 use crate::time::Now;
 use std::cmp::Reverse;
@@ -31,30 +31,6 @@ const ROBOTS_OF_FIRST: usize = 32;
 /// Tasks that are looked at for one robot.
 const LOOKS_PER_ROBOT: usize = 256;
 
-/// A pair that may be made.
-#[derive(Clone, Copy, Debug)]
-pub struct Choice {
-    /// Index of the robot.
-    pub robot: usize,
-    /// Index of the task.
-    pub task: usize,
-    /// What it is about.
-    pub pair: cost::Pair,
-    /// What it costs, before the worth of its class.
-    pub cost: i64,
-}
-
-/// Pairs that may be made, with the tasks that they are about.
-#[derive(Default)]
-pub struct Choices {
-    /// Tasks, each once.
-    pub tasks: Vec<TaskId>,
-    /// What is known of each.
-    pub urgencies: Vec<Urgency>,
-    /// Pairs, each once.
-    pub pairs: Vec<Choice>,
-}
-
 /// What a plan is made of.
 #[derive(Clone, Copy)]
 pub struct Scene<'a> {
@@ -62,8 +38,6 @@ pub struct Scene<'a> {
     pub board: &'a Board,
     /// The clocks.
     pub now: Now,
-    /// What each thing weighs.
-    pub policy: &'a PlannerPolicy,
     /// Robots, by id.
     pub robots: &'a [Robot],
 }
@@ -119,7 +93,7 @@ pub struct Finder<'a> {
     near: BTreeMap<(&'a Arc<Need>, Option<WaypointIx>), Near>,
     /// Tasks that were looked at; none: what it is keeps the task from every robot.
     looked: BTreeMap<&'a TaskId, Option<Looked<'a>>>,
-    found: Choices,
+    found: Weighed,
 }
 
 impl<'a> Finder<'a> {
@@ -136,20 +110,21 @@ impl<'a> Finder<'a> {
             able: BTreeMap::new(),
             near: BTreeMap::new(),
             looked: BTreeMap::new(),
-            found: Choices::default(),
+            found: Weighed::default(),
         }
     }
 
-    /// All pairs that were found.
-    pub fn into_choices(self) -> Choices {
-        self.found
+    /// All pairs that were found, with their robots and tasks.
+    pub fn into_weighed(self) -> Weighed {
+        let robots = self.scene.robots.iter().map(|robot| robot.weighed.clone()).collect();
+        Weighed { robots, ..self.found }
     }
 
     /// Finds the nearest tasks of a robot. False: among those that were looked at there is none that it could do.
     pub fn find_tasks(&mut self, nth: usize, slice: &mut Slice) -> bool {
         let (view, robot) = (self.view, &self.scene.robots[nth]);
         let (mut found, mut looks) = (0, 0);
-        for rank in view.ready.bound_to(&robot.robot_id).take(LOOKS_PER_ROBOT) {
+        for rank in view.ready.bound_to(robot.id()).take(LOOKS_PER_ROBOT) {
             looks += 1;
             found += usize::from(self.add_pair(nth, &rank.task_id));
             if found >= NEAREST {
@@ -200,15 +175,15 @@ impl<'a> Finder<'a> {
         let Some(task) = view.ready.get(task_id) else { return false };
         if let Some(bound_to) = &task.bound_to {
             slice.count_looks(1);
-            let nth = robots.binary_search_by(|robot| robot.robot_id.cmp(bound_to));
-            return nth.is_ok_and(|nth| self.add_pair(nth, task_id) && robots[nth].free != Free::Soon);
+            let nth = robots.binary_search_by(|robot| robot.id().cmp(bound_to));
+            return nth.is_ok_and(|nth| self.add_pair(nth, task_id) && robots[nth].weighed.free != Free::Soon);
         }
         let able = self.find_able(&task.need, &task.rank);
         let mut near = self.near.remove(&(&task.need, task.goal)).unwrap_or_else(|| {
             let field = task.goal.map(|goal| view.router.field_around(goal, routing::closed(view)));
             let way_mm = |robot: &Robot| field.as_ref().map_or(Some(0), |field| field.distance_mm(robot.at));
             let able = robots.iter().enumerate().filter(|(nth, _)| able[*nth]);
-            let ahead = able.filter_map(|(nth, robot)| Some(Reverse((way_mm(robot)? + robot.ready_ms, nth))));
+            let ahead = able.filter_map(|(nth, robot)| Some(Reverse((way_mm(robot)? + robot.weighed.ready_ms, nth))));
             Near { ahead: ahead.collect(), ..Near::default() }
         });
         let most = if robots.len() > ROBOTS_MAX { NEAREST } else { ROBOTS_OF_FIRST };
@@ -221,7 +196,7 @@ impl<'a> Finder<'a> {
             looks += 1;
             if self.add_pair(robot, task_id) {
                 found += 1;
-                is_free |= robots[robot].free != Free::Soon;
+                is_free |= robots[robot].weighed.free != Free::Soon;
             }
         }
         near.asked += 1;
@@ -232,7 +207,7 @@ impl<'a> Finder<'a> {
 
     /// Adds a pair unless something stands against it. Of a robot that is free everything is asked.
     pub fn add_pair(&mut self, robot: usize, task_id: &TaskId) -> bool {
-        let (view, Scene { board, now, policy, robots }) = (self.view, self.scene);
+        let (view, Scene { board, now, robots }) = (self.view, self.scene);
         let Some(ready) = view.ready.get(task_id) else { return false };
         let task_id = &ready.rank.task_id;
         if !self.looked.contains_key(task_id) {
@@ -243,7 +218,7 @@ impl<'a> Finder<'a> {
         if looked.robots.contains(&robot) {
             return true;
         }
-        let Robot { robot_id, at, free, .. } = &robots[robot];
+        let Robot { weighed: WeighedRobot { robot_id, free, .. }, at, energy, .. } = &robots[robot];
         let Demand { task, intake, .. } = looked.demand;
         let is_fit = looked.able[robot]
             && match free {
@@ -254,19 +229,19 @@ impl<'a> Finder<'a> {
             };
         let Some(way_mm) = way_mm(view, *at, ready.goal).filter(|_| is_fit) else { return false };
         let nth = *looked.nth.get_or_insert_with(|| {
-            let Rank { class, since, .. } = ready.rank;
-            self.found.urgencies.push(Urgency { class, since, deadline: task.deadline(intake) });
-            self.found.tasks.push(task_id.clone());
+            let (Rank { class, since, .. }, deadline) = (ready.rank.clone(), task.deadline(intake));
+            self.found.tasks.push(WeighedTask { task_id: task_id.clone(), class, since, deadline });
             self.found.tasks.len() - 1
         });
         looked.robots.insert(robot);
-        let pair = cost::Pair {
+        self.found.pairs.push(WeighedPair {
+            robot,
+            task: nth,
             way_mm,
+            energy_mwh: energy.beyond_model_mwh(way_mm, cost::way_ms(way_mm)),
             has_failed: task.failed_robots.contains(robot_id),
             is_meant: looked.meant_for == Some(robot_id),
-        };
-        let cost = cost::of_pair(policy, &now, &robots[robot], &self.found.urgencies[nth], &pair).sum();
-        self.found.pairs.push(Choice { robot, task: nth, pair, cost });
+        });
         true
     }
 
@@ -289,7 +264,7 @@ impl<'a> Finder<'a> {
     fn find_able(&mut self, need: &'a Arc<Need>, of_task: &Rank) -> Rc<[bool]> {
         let (view, robots) = (self.view, self.scene.robots);
         let is_able = |robot: &Robot, intake| {
-            let session = view.sessions.get(robot.robot_id.as_str());
+            let session = view.sessions.get(robot.id().as_str());
             !robot.is_low && session.is_some_and(|s| eligibility::able(view, &s.row, intake).is_ok())
         };
         let able = self.able.entry(need).or_insert_with(|| {

@@ -3,12 +3,12 @@
 //! Invariants: integers alone; what a class is worth is more than any way there is, so that a task of a higher class goes
 //! first, and as many tasks are given as can be.
 
-use super::robots::Robot;
 use crate::fleet::assignment::estimate::USUAL_MM_S;
 use crate::fleet::projection::chosen::PairCost;
+use crate::fleet::projection::plans::{WeighedPair, WeighedRobot, WeighedTask};
 use crate::planner_policy::PlannerPolicy;
 use crate::task::spec::Class;
-use crate::time::{Now, Utc};
+use crate::time::Utc;
 
 const UNITS_PER_MS: i64 = PairCost::UNITS_PER_MS;
 /// No term counts more than so many milliseconds: 18 hours.
@@ -16,36 +16,20 @@ const TERM_MS_MAX: u64 = 1 << 26;
 /// A robot that failed the task stands behind one that is so much farther away, milliseconds.
 const FAILED_MS: u64 = 60_000;
 
-/// What is known of a task that its cost depends on.
-#[derive(Clone, Copy, Debug)]
-pub struct Urgency {
-    /// Class, after promotions.
-    pub class: Class,
-    /// Since when it is ready.
-    pub since: Utc,
-    /// When it must have ended; none: never.
-    pub deadline: Option<Utc>,
-}
-
-/// What one pair is about.
-#[derive(Clone, Copy, Debug)]
-pub struct Pair {
-    /// From where the robot is free to the task's first goal, millimetres.
-    pub way_mm: u64,
-    /// The robot failed the task before.
-    pub has_failed: bool,
-    /// The task was meant for this robot in the plan before.
-    pub is_meant: bool,
-}
-
 /// What a pair costs before the worth of its class, term by term.
-pub fn of_pair(policy: &PlannerPolicy, now: &Now, robot: &Robot, urgency: &Urgency, pair: &Pair) -> PairCost {
-    let weight = i64::from(policy.travel_weight(urgency.class));
-    let way_ms = pair.way_mm * 1_000 / USUAL_MM_S;
+pub fn of_pair(
+    policy: &PlannerPolicy,
+    now: Utc,
+    robot: &WeighedRobot,
+    task: &WeighedTask,
+    pair: &WeighedPair,
+) -> PairCost {
+    let weight = i64::from(policy.travel_weight(task.class));
+    let way_ms = way_ms(pair.way_mm);
     let failed_ms = if pair.has_failed { FAILED_MS } else { 0 };
-    let age_ms = now.ms_since(urgency.since);
+    let age_ms = now.ms_since(task.since);
     let eta_ms = robot.ready_ms.saturating_add(way_ms);
-    let late_ms = urgency.deadline.map_or(0, |at| now.utc.plus_ms(eta_ms).ms_since(at));
+    let late_ms = task.deadline.map_or(0, |at| now.plus_ms(eta_ms).ms_since(at));
     // Together they count no more than one term may.
     let mut left_ms = TERM_MS_MAX;
     let mut of_way = |ms: u64| {
@@ -53,14 +37,13 @@ pub fn of_pair(policy: &PlannerPolicy, now: &Now, robot: &Robot, urgency: &Urgen
         left_ms -= counted;
         weight * units(counted)
     };
-    let energy_mwh = robot.energy.beyond_model_mwh(pair.way_mm, way_ms);
     let meant_ms = if pair.is_meant { policy.hysteresis_ms } else { 0 };
     PairCost {
         ready: of_way(robot.ready_ms),
         way: of_way(way_ms),
         failed: of_way(failed_ms),
         charge: of_way(robot.loss_ms),
-        energy: energy(energy_mwh, policy),
+        energy: energy(pair.energy_mwh, policy),
         lateness: -units(late_ms) * i64::from(policy.lateness_permille) / 1_000,
         age: -units(age_ms) * i64::from(policy.ageing_permille) / 1_000,
         kept: -weight * units(meant_ms),
@@ -74,6 +57,11 @@ fn energy(mwh: i64, policy: &PlannerPolicy) -> i64 {
     const { assert!(UNITS_PER_MS == 1_000) };
     let most = units(TERM_MS_MAX);
     mwh.saturating_mul(policy.energy_ms_per_wh.into()).clamp(-most, most)
+}
+
+/// Milliseconds that a way usually takes.
+pub fn way_ms(way_mm: u64) -> u64 {
+    way_mm * 1_000 / USUAL_MM_S
 }
 
 fn units(ms: u64) -> i64 {

@@ -3,14 +3,16 @@
 //! Robots that are free soon are weighed too, so that no robot drives far to a task that another will stand beside. What is
 //! meant for them is memory of this process, no row and no promise.
 //!
-//! In reading order: `robots` that may take something; what a pair costs (`cost`); which pairs are weighed (`choices`); the
-//! pairs of least cost (`least_cost`); why these (`reasons`); what gives way to urgent tasks (`preemption`). Called by `assign`. Invariants:
+//! In reading order: `robots` that may take something; which pairs are weighed (`choices`); what a pair costs (`cost`); the
+//! pairs of least cost (`matching`, by `least_cost`); why these (`reasons`); what gives way to urgent tasks (`preemption`). Called by
+//! `assign`. Invariants:
 //! 1. A task of a higher class goes first, and as many tasks are given as can be.
 //! 2. The same rows, heartbeats and memory give the same pairs, in whatever order they came.
 
 mod choices;
 mod cost;
 mod least_cost;
+pub mod matching;
 pub mod preemption;
 mod reasons;
 mod robots;
@@ -20,15 +22,16 @@ use super::{filters, offers};
 use crate::fleet::decision::plan::Plan;
 use crate::fleet::projection::chosen::PlanChoice;
 use crate::fleet::projection::liveness::Board;
+use crate::fleet::projection::plans::{Free, Weighed, WeighedRobot};
 use crate::fleet::projection::queue::Walk;
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::errand_reports;
 use crate::ids::RobotId;
 use crate::planner_policy::PlannerPolicy;
 use crate::time::Now;
-use choices::{Choices, Finder, Scene};
+use choices::{Finder, Scene};
 use reasons::Reasons;
-use robots::{Free, ROBOTS_MAX, Robot};
+use robots::{ROBOTS_MAX, Robot};
 use std::collections::BTreeSet;
 
 /// Of so many robots each is weighed for the first tasks in the queue, half as many again.
@@ -47,32 +50,35 @@ pub fn plan(
     if free.is_empty() {
         return Vec::new();
     }
-    let present: BTreeSet<RobotId> = free.iter().map(|robot| robot.robot_id.clone()).collect();
+    let present: BTreeSet<RobotId> = free.iter().map(|robot| robot.id().clone()).collect();
     if view.queue.is_seen_by_all(&present, heard) {
-        return free.into_iter().filter(|robot| robot.free == Free::Now).map(Candidate::from).collect();
+        return free.into_iter().filter(|robot| robot.weighed.free == Free::Now).map(Candidate::from).collect();
     }
     let mut robots = robots::find_stopping(view, board, &now);
     let room = ROBOTS_MAX.saturating_sub(free.len() + robots.len());
     if room > 0 {
         let mut soon = robots::find_soon(view, board, &now, policy.horizon_ms);
-        soon.sort_by_key(|robot| robot.ready_ms);
+        soon.sort_by_key(|robot| robot.weighed.ready_ms);
         robots.extend(soon.into_iter().take(room));
     }
     robots.extend(free);
-    robots.sort_by(|a, b| a.robot_id.cmp(&b.robot_id));
-    let scene = Scene { board, now, policy, robots: &robots };
-    let (choices, unfinished) = if robots.len() > ROBOTS_MAX {
+    robots.sort_by(|a, b| a.id().cmp(b.id()));
+    let scene = Scene { board, now, robots: &robots };
+    let (weighed, unfinished) = if robots.len() > ROBOTS_MAX {
         find_by_task(view, scene, heard, &present, plan)
     } else {
         (find_by_robot(view, scene, heard, &present, plan), None)
     };
-    let mut pairs = pair_up(robots.len(), &choices);
-    pairs.sort_by(|(_, a), (_, b)| view.queue.rank(&choices.tasks[*a]).cmp(&view.queue.rank(&choices.tasks[*b])));
-    let mut reasons = Reasons::new(&choices, &pairs);
+    let made = matching::choose_pairs(policy, now.utc, &weighed);
+    let rank_of = |view: &FleetProjection, task: usize| view.queue.rank(&weighed.tasks[task].task_id).cloned();
+    let mut pairs = made.clone();
+    pairs.sort_by_cached_key(|(_, task)| rank_of(view, *task));
+    let mut reasons = Reasons::new(policy, now.utc, &weighed, &pairs);
     plan.slice.renew();
     let (mut given, mut recalled, mut meant) = (BTreeSet::new(), false, Vec::new());
     for (robot, nth) in pairs {
-        let (Robot { robot_id, free, ready_ms, .. }, task_id) = (&robots[robot], choices.tasks[nth].clone());
+        let WeighedRobot { robot_id, free, ready_ms, .. } = &weighed.robots[robot];
+        let task_id = weighed.tasks[nth].task_id.clone();
         // The first is decided in any case: else a turn might do nothing, and the next one the same.
         if *free != Free::Soon && (recalled || !given.is_empty()) && plan.is_cut() {
             continue;
@@ -85,7 +91,7 @@ pub fn plan(
             if view.held_by(robot_id).is_some() {
                 plan.report.offers += 1;
                 given.insert(robot_id.clone());
-                let why = reasons.of_task(nth, robot, &scene);
+                let why = reasons.of_task(nth, robot);
                 view.chosen.note_choice(task_id, PlanChoice { is_given: true, ..why });
             }
             continue;
@@ -94,11 +100,14 @@ pub fn plan(
             plan.decide(view, now, "fleet", |tx| errand_reports::stop_errand(tx, robot_id));
             recalled |= !filters::recallable(view, board, robot_id);
         }
-        let why = reasons.of_task(nth, robot, &scene);
+        let why = reasons.of_task(nth, robot);
         view.chosen.note_choice(task_id.clone(), why);
         meant.push((task_id, robot_id.clone(), now.utc.plus_ms(*ready_ms)));
     }
     view.meant.put_plan(meant, now.site);
+    if !made.is_empty() {
+        view.plans.note(now.utc, policy, weighed, made);
+    }
     let is_unfinished = unfinished.is_some();
     if let Some(walk) = unfinished
         && ((given.is_empty() && !recalled) || walk.is_of_news())
@@ -110,13 +119,13 @@ pub fn plan(
     let goes_on = is_unfinished || (!given.is_empty() && given.len() < present.len());
     plan.report.more |= goes_on;
     let is_left =
-        |robot: &Robot| robot.free == Free::Now && !given.contains(&robot.robot_id) && (robot.is_low || !goes_on);
+        |robot: &Robot| robot.weighed.free == Free::Now && !given.contains(robot.id()) && (robot.is_low || !goes_on);
     robots.into_iter().filter(is_left).map(Candidate::from).collect()
 }
 
 impl From<Robot> for Candidate {
     fn from(robot: Robot) -> Self {
-        Self { robot_id: robot.robot_id, at: robot.at, tasks: robot.tasks }
+        Self { robot_id: robot.weighed.robot_id, at: robot.at, tasks: robot.weighed.tasks }
     }
 }
 
@@ -128,20 +137,20 @@ fn find_by_robot(
     heard: &BTreeSet<RobotId>,
     present: &BTreeSet<RobotId>,
     plan: &mut Plan,
-) -> Choices {
+) -> Weighed {
     let rested = view.queue.rested(present, heard);
     let news = view.queue.take_news();
     let mut nothing = BTreeSet::new();
     let mut finder = Finder::new(view, scene);
     for (nth, robot) in scene.robots.iter().enumerate() {
-        let is_rested = rested.contains(&robot.robot_id) && news.len() <= ROBOTS_MAX;
+        let is_rested = rested.contains(robot.id()) && news.len() <= ROBOTS_MAX;
         let has_found = match (robot.is_low, is_rested) {
             (true, _) => false,
             (false, true) => news.iter().filter(|rank| finder.add_pair(nth, &rank.task_id)).count() > 0,
             (false, false) => finder.find_tasks(nth, &mut plan.slice),
         };
-        if !has_found && present.contains(&robot.robot_id) {
-            nothing.insert(robot.robot_id.clone());
+        if !has_found && present.contains(robot.id()) {
+            nothing.insert(robot.id().clone());
         }
     }
     let awake = present.len() - nothing.len();
@@ -154,9 +163,9 @@ fn find_by_robot(
             break;
         }
     }
-    let choices = finder.into_choices();
+    let weighed = finder.into_weighed();
     view.queue.let_rest(nothing);
-    choices
+    weighed
 }
 
 /// Where there are more robots than can be weighed against all tasks: of each of the first tasks the nearest robots. Gives
@@ -167,38 +176,22 @@ fn find_by_task(
     heard: &BTreeSet<RobotId>,
     present: &BTreeSet<RobotId>,
     plan: &mut Plan,
-) -> (Choices, Option<Walk>) {
+) -> (Weighed, Option<Walk>) {
     let mut walk = view.queue.walk(present, heard);
     let mut finder = Finder::new(view, scene);
     let most = plan.slice.decisions();
     let mut found = 0;
     while found < most && !plan.slice.is_spent() {
         let Some(task_id) = view.queue.next(&mut walk) else {
-            let choices = finder.into_choices();
+            let weighed = finder.into_weighed();
             if found == 0 {
                 let left = present.intersection(&walk.robots).cloned().collect();
                 plan.report.more |= view.queue.end(&walk, left, present);
             }
-            return (choices, None);
+            return (weighed, None);
         };
         plan.report.looked += 1;
         found += usize::from(finder.find_robots(&task_id, &mut plan.slice));
     }
-    (finder.into_choices(), Some(walk))
-}
-
-/// The pairs of least cost, as indices of robots and tasks.
-fn pair_up(robots: usize, choices: &Choices) -> Vec<(usize, usize)> {
-    let tasks = choices.tasks.len();
-    let largest = choices.pairs.iter().map(|choice| choice.cost.abs()).max().unwrap_or(0);
-    let are_robots_rows = robots <= tasks;
-    let mut rows = vec![Vec::new(); robots.min(tasks)];
-    for choice in &choices.pairs {
-        let worth = cost::worth(choices.urgencies[choice.task].class, largest, robots.min(tasks));
-        let (row, column) = if are_robots_rows { (choice.robot, choice.task) } else { (choice.task, choice.robot) };
-        rows[row].push((column, choice.cost - worth));
-    }
-    let pairs = least_cost::pair_up(&rows, robots.max(tasks)).into_iter().enumerate();
-    let pairs = pairs.filter_map(|(row, column)| Some((row, column?)));
-    pairs.map(|(row, column)| if are_robots_rows { (row, column) } else { (column, row) }).collect()
+    (finder.into_weighed(), Some(walk))
 }

@@ -52,11 +52,11 @@ pub fn plan(view: &mut FleetProjection, board: &Board, now: Now, policy: &Planne
             continue;
         }
         let fits = |robot: &Robot| {
-            let session = view.sessions.get(robot.robot_id.as_str());
+            let session = view.sessions.get(robot.id().as_str());
             session.is_some_and(|session| eligibility::fits(view, &session.row, task, intake).is_ok())
         };
         let demand = Demand::new(view, task, intake);
-        let can = |robot: &Robot| filters::pair(view, board, &robot.robot_id, &demand, &now).is_ok();
+        let can = |robot: &Robot| filters::pair(view, board, robot.id(), &demand, &now).is_ok();
         let awaited = nearest(view, goal, soon.iter(), fits);
         let taken = nearest(view, goal, at_work.iter().map(|(_, robot)| robot), can);
         let gains = |(eta_ms, way_ms, _): &(u64, u64, usize)| {
@@ -64,7 +64,7 @@ pub fn plan(view: &mut FleetProjection, board: &Board, now: Now, policy: &Planne
         };
         if let Some((.., nth)) = taken.filter(gains) {
             let (gives_way, robot) = at_work.swap_remove(nth);
-            let why = Reason::from(Code::UrgentSuspend).with("robot_id", &robot.robot_id).with("task_id", &task_id);
+            let why = Reason::from(Code::UrgentSuspend).with("robot_id", robot.id()).with("task_id", &task_id);
             plan.decide(view, now, "fleet", |tx| {
                 apply_event(tx, &gives_way, News::from_event(Event::Suspend, Some(&why)));
             });
@@ -90,7 +90,7 @@ fn nearest<'r>(
     let eta = |(nth, robot): (usize, &Robot)| {
         let way_mm = field.as_ref().map_or(Some(0), |field| field.distance_mm(robot.at))?;
         let way_ms = way_mm * 1_000 / USUAL_MM_S;
-        Some((robot.ready_ms + way_ms, way_ms, nth))
+        Some((robot.weighed.ready_ms + way_ms, way_ms, nth))
     };
     robots.enumerate().filter(|(_, robot)| can(robot)).filter_map(eta).min()
 }

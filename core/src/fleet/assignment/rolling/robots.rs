@@ -6,6 +6,7 @@ use crate::energy::{self, RobotEnergy};
 use crate::fleet::assignment::estimate::{Rest, USUAL_MM_S};
 use crate::fleet::assignment::filters;
 use crate::fleet::projection::liveness::Board;
+use crate::fleet::projection::plans::{Free, WeighedRobot};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::transitions::may_suspend;
 use crate::fleet::traffic::routing;
@@ -29,36 +30,24 @@ const LOSS_MS_PER_PERMILLE: u64 = 100;
 /// The end of a task and the next offer take about so long, milliseconds.
 const HAND_OVER_MS: u64 = 500;
 
-/// From when on a robot could do a task.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Free {
-    /// It waits for work.
-    Now,
-    /// Once its errand was broken off.
-    AfterErrand,
-    /// By itself, soon.
-    Soon,
-}
-
 /// A robot that a plan looks at.
 #[derive(Clone, Debug)]
 pub struct Robot {
-    /// The robot that it is.
-    pub robot_id: RobotId,
+    /// What its pairs are weighed by.
+    pub weighed: WeighedRobot,
     /// Where it is free.
     pub at: WaypointIx,
-    /// From when on.
-    pub free: Free,
-    /// In so many milliseconds.
-    pub ready_ms: u64,
-    /// What it costs beside time to take it from what it does, milliseconds on the way: charge that it does not get.
-    pub loss_ms: u64,
     /// It must charge before it does anything.
     pub is_low: bool,
-    /// Tasks that it was given so far.
-    pub tasks: u64,
     /// What its work costs.
     pub energy: RobotEnergy,
+}
+
+impl Robot {
+    /// The robot that it is.
+    pub fn id(&self) -> &RobotId {
+        &self.weighed.robot_id
+    }
 }
 
 /// Robots that are free, or whose errand may be broken off, by id.
@@ -78,7 +67,8 @@ pub fn find_free(view: &FleetProjection, board: &Board, now: &Now) -> Vec<Robot>
         let at = routing::find(view, live.report.vitals.waypoint.as_ref())?;
         let loss_ms = if free == Free::AfterErrand { loss_ms(view, live, at) } else { 0 };
         let is_low = is_low(view, live, at);
-        Some(Robot { loss_ms, is_low, ..robot(view, robot_id, at, free, ready_ms) })
+        let robot = robot(view, robot_id, at, free, ready_ms);
+        Some(Robot { weighed: WeighedRobot { loss_ms, ..robot.weighed }, is_low, ..robot })
     };
     board.keys().filter_map(robot).collect()
 }
@@ -135,8 +125,8 @@ pub fn find_soon(view: &FleetProjection, board: &Board, now: &Now, horizon_ms: u
 
 fn robot(view: &FleetProjection, robot_id: &RobotId, at: WaypointIx, free: Free, ready_ms: u64) -> Robot {
     let tasks = view.control.get(robot_id.as_str()).map_or(0, |c| c.row.tasks);
-    let energy = *view.energy_of(robot_id);
-    Robot { robot_id: robot_id.clone(), at, free, ready_ms, loss_ms: 0, is_low: false, tasks, energy }
+    let weighed = WeighedRobot { robot_id: robot_id.clone(), free, ready_ms, loss_ms: 0, tasks };
+    Robot { weighed, at, is_low: false, energy: *view.energy_of(robot_id) }
 }
 
 /// Whether a robot must charge before it does anything, on a site where it can.
