@@ -1,14 +1,15 @@
 //! `midshift planner …`: live rules of the site's planner, and the plans that it made.
 
 mod replay;
+mod rules;
 
 use super::client::{Call, Change, Exit, unary};
 use super::out::Out;
-use clap::{Subcommand, ValueEnum};
+use clap::Subcommand;
 use midshift_proto::convert::ms_of;
 use midshift_proto::fleet::v1;
+use rules::Rules;
 use std::path::PathBuf;
-use std::time::Duration;
 
 /// Verbs of the planner.
 #[derive(Subcommand)]
@@ -46,70 +47,6 @@ pub enum Verb {
         #[command(flatten)]
         rules: Rules,
     },
-}
-
-/// How robots are chosen.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum Policy {
-    /// All tasks that may be given at once, by least cost, with an eye to robots that are free soon.
-    Rolling,
-    /// Tasks in the order of the queue, each to the nearest robot that is free. Reads no other rule.
-    FifoNearest,
-}
-
-/// What is to change; what is not named stays.
-#[derive(clap::Args, Default)]
-pub struct Rules {
-    /// How robots are chosen.
-    #[arg(long)]
-    policy: Option<Policy>,
-    /// A robot that is free within this time is taken into account already, at most 60s; 0s: none is.
-    #[arg(long, value_parser = super::duration)]
-    horizon: Option<Duration>,
-    /// What a second on the way to an urgent task weighs, 1 to 100.
-    #[arg(long, value_name = "WEIGHT")]
-    urgent_weight: Option<u32>,
-    /// The same of a normal task.
-    #[arg(long, value_name = "WEIGHT")]
-    normal_weight: Option<u32>,
-    /// The same of a background task.
-    #[arg(long, value_name = "WEIGHT")]
-    background_weight: Option<u32>,
-    /// What a task gains by each second that it has waited, in thousandths of a second on the way.
-    #[arg(long, value_name = "PERMILLE")]
-    ageing: Option<u32>,
-    /// What each second past a deadline weighs, in thousandths of a second on the way.
-    #[arg(long, value_name = "PERMILLE")]
-    lateness: Option<u32>,
-    /// What must be gained, in time on the way, before a task is meant for another robot than it was; at most 60s.
-    #[arg(long, value_parser = super::duration)]
-    hysteresis: Option<Duration>,
-    /// What each watt-hour weighs that a robot takes more than a usual one on its way to a task, in milliseconds on the way;
-    /// 0: nothing.
-    #[arg(long, value_name = "MS")]
-    energy_weight: Option<u32>,
-}
-
-impl Rules {
-    /// The rules after the change.
-    fn over(self, old: v1::PlannerPolicy) -> v1::PlannerPolicy {
-        let policy = self.policy.map(|policy| match policy {
-            Policy::Rolling => v1::AssignmentPolicy::Rolling as i32,
-            Policy::FifoNearest => v1::AssignmentPolicy::FifoNearest as i32,
-        });
-        v1::PlannerPolicy {
-            policy: policy.or(old.policy),
-            horizon: self.horizon.map(super::area::milliseconds).or(old.horizon),
-            urgent_travel_weight: self.urgent_weight.or(old.urgent_travel_weight),
-            normal_travel_weight: self.normal_weight.or(old.normal_travel_weight),
-            background_travel_weight: self.background_weight.or(old.background_travel_weight),
-            ageing_permille: self.ageing.or(old.ageing_permille),
-            lateness_permille: self.lateness.or(old.lateness_permille),
-            hysteresis: self.hysteresis.map(super::area::milliseconds).or(old.hysteresis),
-            energy_ms_per_wh: self.energy_weight.or(old.energy_ms_per_wh),
-            ..old
-        }
-    }
 }
 
 /// Runs one verb.
@@ -175,11 +112,13 @@ fn describe(policy: &v1::PlannerPolicy) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::rules::Policy;
     use super::*;
     use midshift_core::ids::SiteId;
     use midshift_core::planner_policy::PlannerPolicy;
     use midshift_core::rows::Revision;
     use midshift_proto::convert::fleet::encode_planner;
+    use std::time::Duration;
 
     fn old() -> v1::PlannerPolicy {
         let site_id = SiteId::parse("hall").expect("an id");

@@ -1,12 +1,21 @@
-//! What parts of the suite are run with, and what their tests added up to.
+//! What parts of the suite are run with, how test programs are run, two at once, and what their tests added up to.
+//!
+//! Invariant: what a program says is shown when it has ended, so that no two are mixed; one that fails keeps no other from running.
 
-use crate::clients;
 use crate::fetch_tools::Tools;
-use crate::programs::TestProgram;
+use crate::programs::{Choice, TestProgram};
+use crate::slowest::Slowest;
 use crate::workspace::Workspace;
+use crate::{clients, run};
 use anyhow::{Context, Result};
+use std::collections::VecDeque;
 use std::process::Command;
-use std::sync::OnceLock;
+use std::sync::mpsc::sync_channel;
+use std::sync::{Mutex, OnceLock};
+use std::time::Duration;
+
+/// Programs that run at once: a test that waits, or the last long one of a program, leaves a core to the other.
+const AT_ONCE: usize = 2;
 
 /// How much is asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -72,6 +81,69 @@ impl<'w> Round<'w> {
             let _ = self.built.set(TestProgram::build_all(self.workspace)?);
         }
         self.built.get().map(Vec::as_slice).context("they were built")
+    }
+}
+
+/// What one printed, with when, and whether it succeeded.
+struct Ended {
+    lines: Vec<(String, Duration)>,
+    succeeded: Result<bool>,
+}
+
+impl Round<'_> {
+    /// Runs tests of these programs; whether all passed. The slowest are named.
+    #[expect(clippy::disallowed_methods, reason = "seconds of the tests by the wall, for a person")]
+    pub fn play(&self, programs: &[&TestProgram], choice: Choice<'_>, count: &mut Count) -> Result<bool> {
+        let mut order = programs.to_vec();
+        order.sort_by_key(|program| program.rank());
+        let queue = Mutex::new(VecDeque::from(order));
+        let (ended, ends) = sync_channel(AT_ONCE);
+        let begun = std::time::Instant::now();
+        let one = |program: &TestProgram| -> Ended {
+            let mut lines = Vec::new();
+            let succeeded = self.test_command(program, choice).and_then(|mut command| {
+                run::reading(&mut command, |line| lines.push((line.to_owned(), begun.elapsed())))
+            });
+            Ended { lines, succeeded }
+        };
+        let (mut passed, mut slowest) = (true, Vec::new());
+        std::thread::scope(|scope| {
+            for _ in 0..AT_ONCE {
+                let (queue, one, ended) = (&queue, &one, ended.clone());
+                scope.spawn(move || {
+                    // A panic of the other one leaves the queue as it is.
+                    let next = || queue.lock().unwrap_or_else(std::sync::PoisonError::into_inner).pop_front();
+                    while let Some(program) = next() {
+                        // Nobody listens any more where the other side has panicked.
+                        let _ = ended.send(one(program));
+                    }
+                });
+            }
+            drop(ended);
+            for Ended { lines, succeeded } in ends {
+                let mut times = Slowest::new(threads());
+                for (line, at) in lines {
+                    count.add(&line);
+                    times.add(&line, at);
+                    run::print(&line);
+                }
+                slowest.extend(times.list());
+                passed &= succeeded.unwrap_or_else(|error| {
+                    run::tell_person(&format!("error: {error:#}"));
+                    false
+                });
+            }
+        });
+        slowest.sort_by(|a, b| b.cmp(a));
+        run::say_slowest(&slowest);
+        Ok(passed)
+    }
+
+    fn test_command(&self, program: &TestProgram, choice: Choice<'_>) -> Result<Command> {
+        let mut command = program.command(self.workspace);
+        command.args(choice.filter).env("RUST_TEST_THREADS", threads().to_string()).envs(choice.variable);
+        self.surround(&mut command)?;
+        Ok(command)
     }
 }
 

@@ -1,11 +1,12 @@
 //! Plans that the planner made: listed, shown, and made once more from a file.
 
-use super::Rules;
+use super::rules::Rules;
 use crate::client::Exit;
 use crate::out::Out;
 use midshift_core::fleet::assignment::rolling::matching;
 use midshift_core::fleet::projection::chosen::PairCost;
 use midshift_core::fleet::projection::plans::{Free, PlanRecord};
+use midshift_core::planner_policy::{AssignmentPolicy, PlannerPolicy};
 use midshift_core::reason::Violations;
 use midshift_proto::convert::fleet::{encode_planner, parse_planner};
 use midshift_proto::convert::plan::{encode_plan, parse_plan};
@@ -42,11 +43,7 @@ pub fn show(plan: &v1::Plan, out: &Out) -> Result<(), Exit> {
 /// Makes the decision of a plan once more, by its own rules or with some changed.
 pub fn run(file: &Path, rules: Rules, out: &Out) -> Result<(), Exit> {
     let was = read(from_file(file)?)?;
-    let site_id = was.policy.site_id.clone();
-    let mut bad = Violations::default();
-    let changed = rules.over(encode_planner(&was.policy, None));
-    let policy = parse_planner(changed, &site_id, At::top("policy"), &mut bad);
-    let policy = policy.ok_or_else(|| wrong("these rules", &bad))?;
+    let policy = change(&was.policy, rules)?;
     let made = matching::choose_pairs(&policy, was.at, &was.weighed);
     let is_by_own = policy == was.policy;
     let now = PlanRecord { policy, made, ..was.clone() };
@@ -55,6 +52,20 @@ pub fn run(file: &Path, rules: Rules, out: &Out) -> Result<(), Exit> {
         return Err(Exit::new(1, "by the same rules this version decides otherwise: the plan is of another version"));
     }
     Ok(())
+}
+
+/// The rules of a plan with some changed.
+fn change(was: &PlannerPolicy, rules: Rules) -> Result<PlannerPolicy, Exit> {
+    let mut bad = Violations::default();
+    let policy = parse_planner(rules.over(encode_planner(was, None)), &was.site_id, At::top("policy"), &mut bad);
+    let policy = policy.ok_or_else(|| wrong("these rules", &bad))?;
+    if policy.policy != AssignmentPolicy::Rolling {
+        return Err(Exit::usage("fifo-nearest weighs no pairs: a plan can be made once more by rolling alone"));
+    }
+    if policy.horizon_ms != was.horizon_ms {
+        return Err(Exit::usage("which robots are weighed is part of the plan: another horizon changes nothing of it"));
+    }
+    Ok(policy)
 }
 
 fn from_file(file: &Path) -> Result<v1::Plan, Exit> {
@@ -155,7 +166,6 @@ mod tests {
     use super::*;
     use midshift_core::fleet::projection::plans::{Weighed, WeighedPair, WeighedRobot, WeighedTask};
     use midshift_core::ids::{RobotId, SiteId, TaskId};
-    use midshift_core::planner_policy::PlannerPolicy;
     use midshift_core::task::spec::Class;
     use midshift_core::time::Utc;
 
@@ -192,6 +202,19 @@ mod tests {
         let told = "plan 3 of 2027-01-15T08:10:00Z: 1 robots and 2 tasks weighed in 2 pairs, 1 made\n  \
                     old  given to r1: weighs -20.0 s\n";
         assert_eq!(describe(&plan()), told);
+    }
+
+    #[test]
+    fn rules_that_are_wrong_or_weigh_nothing_are_refused() {
+        let policy = plan().policy;
+        assert_eq!(change(&policy, Rules::default()).expect("its own"), policy);
+        let refused = |rules| change(&policy, rules).expect_err("refused").to_string();
+        let wrong = refused(Rules { ageing: Some(10_001), urgent_weight: Some(0), ..Rules::default() });
+        assert!(wrong.contains("policy.ageing_permille") && wrong.contains("policy.urgent_travel_weight"), "{wrong}");
+        let fifo = refused(Rules { policy: Some(crate::planner::rules::Policy::FifoNearest), ..Rules::default() });
+        assert!(fifo.contains("rolling alone"), "{fifo}");
+        let farther = refused(Rules { horizon: Some(std::time::Duration::from_secs(1)), ..Rules::default() });
+        assert!(farther.contains("part of the plan"), "{farther}");
     }
 
     #[test]

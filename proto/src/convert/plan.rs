@@ -101,13 +101,17 @@ pub fn parse_plan(wire: v1::Plan) -> Result<PlanRecord, Violations> {
     for (nth, pair) in weighed.pairs.iter().enumerate() {
         let is_new = known.insert((pair.robot, pair.task));
         if pair.robot >= robots || pair.task >= tasks || !is_new {
-            tell(&mut bad, At::top("pairs").index(nth), "must name a robot and a task of the plan, and each pair once");
+            tell_fault(
+                &mut bad,
+                At::top("pairs").index(nth),
+                "must name a robot and a task of the plan, and each pair once",
+            );
         }
     }
     let made: Vec<_> = wire.decisions.iter().map(|made| (made.robot as usize, made.task as usize)).collect();
     for (nth, pair) in made.iter().enumerate() {
         if !known.contains(pair) {
-            tell(&mut bad, At::top("decisions").index(nth), "must be one of the pairs");
+            tell_fault(&mut bad, At::top("decisions").index(nth), "must be one of the pairs");
         }
     }
     match at.zip(policy).filter(|_| bad.0.is_empty()) {
@@ -122,7 +126,7 @@ fn read<T, W: Parse<T>>(wire: Vec<W>, name: &'static str, bad: &mut Violations) 
     wire.into_iter().enumerate().map_while(|(nth, item)| item.parse_at(at.index(nth), bad)).collect()
 }
 
-fn tell(bad: &mut Violations, at: At<'_>, fault: &str) {
+fn tell_fault(bad: &mut Violations, at: At<'_>, fault: &str) {
     if bad.0.len() < FAULTS_TOLD {
         bad.add(at.to_string(), fault);
     }

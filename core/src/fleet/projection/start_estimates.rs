@@ -225,7 +225,7 @@ mod tests {
             starts.estimate(&outlook(Utc(now.0 - 1_000 * waited_s), None), now).expect("enough is known")
         };
         assert!(told(0).p50.ms_since(now) < 10_000, "most wait 5 s");
-        assert!(told(10).p10.ms_since(now) > 80_000, "those that waited 10 s are of the other kind: {:?}", told(10));
+        assert!(told(10).p10.ms_since(now) > 70_000, "those that waited 10 s are of the other kind: {:?}", told(10));
     }
 
     #[test]
