@@ -239,6 +239,16 @@ pub const CLAIMED_PLACE_MARGIN_MM: i32 = 3_000;
 pub const RESTORED_LATELY: SiteDuration = SiteDuration::from_secs(600);
 /// Charge that must be left at the charger, permille: an hour and a half of waiting on the way.
 pub const CHARGE_RESERVE_PERMILLE: u64 = 100;
+/// Robots that a search for a safe order of grants walks over: the first of the connected part in queue order; the others count as standing.
+pub const SAFE_ORDER_ROBOTS_MAX: usize = 256;
+/// Orders that such a search tries: the first is that of the queue.
+pub const SAFE_ORDER_TRIES_MAX: u64 = 64;
+/// Robots that such a search looks at in all its tries together, each as often as it does: some milliseconds.
+pub const SAFE_ORDER_LOOKS_MAX: usize = 16_384;
+/// Bays whose ways are measured from a waypoint, the nearest by the beeline: each costs a distance field, which is remembered.
+pub const BAYS_LOOKED_AT_MAX: usize = 64;
+/// Bays that are tried for one robot, the nearest by their ways: where eight are taken, the next is seldom free or near.
+pub const BAYS_TRIED_MAX: usize = 8;
 /// Places that one robot holds: its end takes them all back in one item, beside its timers and counters.
 pub const PLACES_OF_ROBOT_MAX: usize = 128;
 /// A decision that the store refused for good so often is put aside: the second refusal shows that trying again does not help.

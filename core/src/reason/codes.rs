@@ -218,6 +218,8 @@ codes! {
     RouteTooLong = "ROUTE_TOO_LONG", "The way through all goals of the task has more points than a robot takes. Split the task.";
     PlaceOccupied = "PLACE_OCCUPIED", "A place on the way is held by another robot, or closed because nobody knows what a robot does there."
         => "`midshift zone ls --in-use` shows who holds it. If it is closed, look there, then `midshift zone clear PLACE --reason TEXT --if-match ETAG`.";
+    UnsafeOrder = "UNSAFE_ORDER", "The places on the way are free, and if the robot went on now, robots could stand in each other's way for ever. It goes on once others have gone first; nobody has to do anything."
+        => "If it lasts, one of the robots that it names does not go on: `midshift robot explain ROBOT` says why.";
     ExcludedAfterFailure = "EXCLUDED_AFTER_FAILURE", "The robot failed this task and the task asks for another.";
     BoundElsewhere = "BOUND_ELSEWHERE", "The task is opened: its item is on another robot.";
     // --- why a task waits or ended

@@ -58,8 +58,8 @@ rules! {
     TwoWaySingleWidth = "TWO_WAY_SINGLE_WIDTH", Error, "Two robots can meet here and neither can pass. Put both directions into an exclusive passage, make it one-way, or say ways = \"wide\".";
     NoBayBeforePassage = "NO_BAY_BEFORE_PASSAGE", Error, "Robots come from both sides of this passage and there is no standing place to wait at its end. Let the lanes into it begin at hold points.";
     FarFromPassage = "FAR_FROM_PASSAGE", Warning, "The lanes into this exclusive passage begin at no standing place, so it is kept for a robot that is still far away. Put a hold point before it.";
-    AreaAdmitsNobody = "AREA_ADMITS_NOBODY", Error, "An area admits one robot fewer than it has seats at standing places, and this one has fewer than two.";
-    StandingBelowRobots = "STANDING_BELOW_ROBOTS", Error, "The areas admit fewer robots than there are.";
+    AreaAdmitsNobody = "AREA_ADMITS_NOBODY", Error, "The area has fewer than two seats at standing places, so a robot inside cannot make room for another. Add one.";
+    StandingBelowRobots = "STANDING_BELOW_ROBOTS", Error, "With one seat of each area left free, so that robots can make room, there are fewer seats than robots.";
     BaysBelowRobots = "BAYS_BELOW_ROBOTS", Warning, "Hold points and parking places have fewer seats than there are robots, so a robot may have to wait in a station that another needs.";
     NoBayFromStation = "NO_BAY_FROM_STATION", Error, "From this station no hold point or parking place is reached without passing another standing place, so a robot cannot make room.";
     FastNearPeople = "FAST_NEAR_PEOPLE", Warning, "People walk here, and the file lets robots drive faster than 600 mm/s or come nearer than 500 mm. Leave both values out, or know why not.";

@@ -436,7 +436,7 @@ impl Site {
     pub fn standing_capacity(&self, kind: Kind) -> u64 {
         self.of_kind(kind).filter_map(|w| self.standing_at(w)).map(|p| u64::from(self.place(p).capacity)).sum()
     }
-    /// Robots that can stand reserved in one area at the same time; it admits one fewer.
+    /// Robots that can stand reserved in one area at the same time. One more than should: those inside need room to move.
     pub fn area_capacity(&self, area: AreaIx) -> u64 {
         let inside = self.waypoints.iter().filter(|w| w.area == area).filter_map(|w| w.standing);
         inside.map(|p| u64::from(self.place(p).capacity)).sum()

@@ -10,7 +10,7 @@ use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::attempts;
 use crate::fleet::tasks::transitions::arm;
 use crate::fleet::traffic::anchor::anchor;
-use crate::fleet::traffic::{routing, starts};
+use crate::fleet::traffic::{route_requests, routing, starts};
 use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{AttemptId, RobotId, Subject, WaypointId};
 use crate::limits;
@@ -73,20 +73,31 @@ struct Wants {
 }
 
 impl Wants {
-    fn new(view: &FleetProjection, here: WaypointIx, battery_permille: u16, waiting: bool) -> Self {
+    fn new(view: &FleetProjection, robot_id: &RobotId, here: WaypointIx, battery_permille: u16, waiting: bool) -> Self {
         let policy = view.policy(&view.site.area_of(here).area_id);
         let must = battery_permille < policy.charge_mandatory_permille;
         let may = battery_permille < policy.charge_opportunistic_permille && !waiting;
         let kind = view.site.waypoint(here).kind;
-        let is_settled = matches!(kind, Kind::Park) || (matches!(kind, Kind::Charger | Kind::Hold) && !waiting);
+        let is_settled = match kind {
+            Kind::Park => true,
+            Kind::Charger => !waiting,
+            Kind::Hold => !waiting && !is_wanted(view, robot_id, here),
+            _ => false,
+        };
         Self { charge: must || may, park: !is_settled && view.site.collisions_modelled() }
     }
+}
+
+/// Whether another robot waits for the last seat of the place that this one stands in.
+fn is_wanted(view: &FleetProjection, robot_id: &RobotId, here: WaypointIx) -> bool {
+    let place = view.site.standing_at(here).map(|place| &view.site.place(place).place_id);
+    place.is_some_and(|place_id| route_requests::is_waited_for(view, robot_id, place_id))
 }
 
 /// Whether an idle robot would do anything while no task waits. Where it would go is not looked for.
 pub(super) fn wants_any(view: &FleetProjection, live: &NewestHeartbeat) -> bool {
     let vitals = &live.report.vitals;
-    let wants = |here| Wants::new(view, here, vitals.battery_permille, false);
+    let wants = |here| Wants::new(view, &live.robot_id, here, vitals.battery_permille, false);
     routing::find(view, vitals.waypoint.as_ref()).map(wants).is_some_and(|wants| wants.charge || wants.park)
 }
 
@@ -99,7 +110,7 @@ fn wish(
     waiting: bool,
 ) -> Option<(Errand, WaypointIx)> {
     let free = |goals: &mut dyn Iterator<Item = WaypointIx>| free(view, coming, robot_id, here, goals);
-    let wants = Wants::new(view, here, battery_permille, waiting);
+    let wants = Wants::new(view, robot_id, here, battery_permille, waiting);
     if wants.charge
         && let Some(charger) = free(&mut view.site.chargers())
     {
@@ -118,8 +129,8 @@ pub(in crate::fleet) fn park_for(view: &FleetProjection, robot_id: &RobotId, her
 fn park_goal(view: &FleetProjection, coming: &Coming, robot_id: &RobotId, here: WaypointIx) -> Option<WaypointIx> {
     let free = |goals: &mut dyn Iterator<Item = WaypointIx>| free(view, coming, robot_id, here, goals);
     let goal = match free(&mut view.site.parks()) {
-        None if view.site.waypoint(here).kind == Kind::Hold => None,
-        None => free(&mut view.site.hold_points()),
+        None if view.site.waypoint(here).kind == Kind::Hold && !is_wanted(view, robot_id, here) => None,
+        None => free(&mut view.site.hold_points().filter(|at| *at != here)),
         park => park,
     }?;
     (goal != here).then_some(goal)

@@ -11,12 +11,12 @@ use crate::fleet::decision::report::WAITS_FOR;
 use crate::fleet::facts::stops::Hold;
 use crate::fleet::projection::broken_steps::StepAt;
 use crate::fleet::projection::liveness::{self, Board};
-use crate::fleet::projection::memory::MeantFor;
+use crate::fleet::projection::memory::{MeantFor, Waiting};
 use crate::fleet::projection::queue::Wait;
 use crate::fleet::projection::rows::{Place, RobotHolder};
 use crate::fleet::projection::state::FleetProjection;
 use crate::fleet::tasks::{claims, eligibility, plausible};
-use crate::fleet::traffic::{blocked_places, closed_places, engaged_stops, grants, route_requests, starts};
+use crate::fleet::traffic::{blocked_places, closed_places, engaged_stops, route_requests, starts};
 use crate::heartbeat::NewestHeartbeat;
 use crate::ids::{PlaceId, RobotId};
 use crate::presence::Presence;
@@ -308,10 +308,13 @@ pub fn of_robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &Rob
     }
 }
 
-/// Which places the robot waits for, and what is in the way: a place that is closed or blocked, holders of one without a free seat, robots that start
-/// there, a stop, whoever came first, an area that is full, or a free seat that others go to first. None: it waits for none.
+/// Which places the robot waits for, and what is in the way: robots that must go first, a place that is closed or blocked, holders of one without
+/// a free seat, robots that start there, a stop, whoever came first, or a free seat that others go to first. None: it waits for none.
 pub fn place_wait(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> {
     let wait = view.waits.get(robot_id)?;
+    if let Some(robots) = wait.for_order.as_ref().filter(|robots| !robots.is_empty()) {
+        return Some(order_wait(wait, robots));
+    }
     let mut reason = Reason::from(Code::PlaceOccupied);
     for (key, told, who) in in_the_way(view, robot_id, &wait.places) {
         if who.is_empty() {
@@ -336,12 +339,21 @@ pub fn place_wait(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> 
     Some(reason.with("places", places))
 }
 
+/// The places are free, and these robots must go first.
+fn order_wait(wait: &Waiting, robots: &[RobotId]) -> Reason {
+    let places = wait.places.iter().map(ToString::to_string).collect::<Vec<_>>();
+    let names = robots.iter().map(ToString::to_string).collect::<Vec<_>>();
+    let told = format!("{}: an order with {}", places.join(", "), names.join(", "));
+    let reason = Reason::from(Code::UnsafeOrder).with("robots", names.join(" ")).with("places", places.join(" "));
+    reason.with(WAITS_FOR, told)
+}
+
 /// What may be in the way of a robot to places, by the fact that names it: the first that is there is told.
 fn in_the_way(
     view: &FleetProjection,
     robot_id: &RobotId,
     places: &[PlaceId],
-) -> [(&'static str, &'static str, BTreeSet<String>); 8] {
+) -> [(&'static str, &'static str, BTreeSet<String>); 7] {
     let rows = || places.iter().filter_map(|id| view.places.get(id.as_str())).map(|p| &p.row);
     let known = || places.iter().filter_map(|id| view.site.find_place(id));
     let others = |id: &&RobotId| *id != robot_id;
@@ -349,8 +361,6 @@ fn in_the_way(
     let mine = view.waits.get(robot_id).map(|w| w.since).unwrap_or_default();
     let wants = |other: &PlaceId| places.contains(other);
     let earlier = view.waits.iter().filter(|(_, w)| w.since <= mine && w.places.iter().any(wants)).map(|(id, _)| id);
-    let areas = known().filter_map(|ix| view.site.place(ix).waypoint()).map(|at| &view.site.area_of(at).area_id);
-    let inside: BTreeSet<RobotId> = areas.flat_map(|area| grants::robots_in_area(view, area)).collect();
     let closed = engaged_stops::closed(view);
     let has_seat = |p: &Place| {
         let known = view.site.find_place(&p.place_id);
@@ -386,11 +396,6 @@ fn in_the_way(
             known().filter(|ix| closed.contains(ix)).map(|ix| view.site.place(ix).place_id.to_string()).collect(),
         ),
         ("first", "waits for a place that another robot waits for since earlier", names(&mut { earlier })),
-        (
-            "area_full_of",
-            "waits for a place in an area that has as many robots as can move there",
-            names(&mut inside.iter()),
-        ),
         ("beside", "waits for a place that has a free seat and is kept for others", holders(true)),
     ]
 }

@@ -42,6 +42,8 @@ pub struct AttachedTime {
 pub struct Waiting {
     /// Places it asked for and did not get.
     pub places: Vec<crate::ids::PlaceId>,
+    /// All of them are free, and behind the grant there would be no order for these robots to go on. None: a place is not free.
+    pub for_order: Option<Vec<RobotId>>,
     /// Since when.
     pub since: crate::time::SiteTime,
 }

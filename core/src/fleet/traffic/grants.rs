@@ -1,16 +1,21 @@
 //! Whether places can be granted to a robot, and the grant of them: all that one stretch needs, or none.
 //!
-//! Invariant: a place has no more holders than seats, and an area admits one robot less than it has. Grants are traffic, never a safety function.
+//! Invariant: a place has no more holders than seats, and a stretch is granted only if `safe_order` finds that everybody can go on behind it.
+//! Grants are traffic, never a safety function.
 
 use super::anchor::next_generation;
-use super::{blocked_places, engaged_stops, starts};
+use super::route_requests::Request;
+use super::safe_order::{Mover, SafeOrder};
+use super::{blocked_places, engaged_stops, remaining_routes, starts};
 use crate::fleet::decision::plan::Tx;
+use crate::fleet::projection::liveness::Board;
 use crate::fleet::projection::rows::{HolderState, PlaceBlock, PlaceHolder};
 use crate::fleet::projection::state::FleetProjection;
 use crate::ids::{AreaId, PlaceId, RobotId};
 use crate::limits;
-use crate::site::{AreaIx, PlaceIx};
-use std::collections::{BTreeMap, BTreeSet};
+use crate::site::PlaceIx;
+use crate::time::Now;
+use std::collections::BTreeSet;
 
 /// Grant ids of one generation: more than the places of any one stretch.
 const GRANTS_PER_GENERATION: u64 = 1024;
@@ -22,28 +27,25 @@ pub(super) struct Occupancy {
     blocked: BTreeSet<PlaceIx>,
     /// Places that nobody is let into.
     barred: BTreeSet<PlaceIx>,
-    /// Robots that hold a standing place of an area, or start in one.
-    inside: BTreeMap<AreaIx, BTreeSet<RobotId>>,
+    /// Where all robots go. None: nobody asks, or the site has no places.
+    order: Option<SafeOrder>,
+}
+
+/// Why a stretch is not granted.
+pub(super) enum Refused {
+    /// A place has no seat for it, is kept for an earlier request, or admits nobody.
+    NoRoom,
+    /// Behind the grant there would be no order for these and the robot to go on; none: they are not known.
+    Unsafe(Vec<RobotId>),
 }
 
 impl Occupancy {
-    pub fn from_projection(view: &FleetProjection) -> Self {
-        let mut occupancy = Self { barred: blocked_places::barred(view), ..Self::default() };
-        let standing = view.site.places().iter().filter(|p| p.waypoint().is_some());
-        for place in standing {
-            let Some(row) = view.places.get(place.place_id.as_str()).map(|p| &p.row) else { continue };
-            for holder in &row.holders {
-                occupancy.enter(view, &holder.robot_id, place);
-            }
-        }
-        for (robot_id, place) in starts::all_awaited(view) {
-            occupancy.enter(view, robot_id, view.site.place(place));
-        }
-        occupancy
-    }
-    fn enter(&mut self, view: &FleetProjection, robot_id: &RobotId, place: &crate::site::Place) {
-        let Some(area) = place.waypoint().map(|w| view.site.waypoint(w).area) else { return };
-        self.inside.entry(area).or_default().insert(robot_id.clone());
+    /// As the rows are now, for these requests in their order.
+    pub fn gather(view: &FleetProjection, board: &Board, now: &Now, requests: &[Request]) -> Self {
+        let barred = blocked_places::barred(view);
+        let order = (!requests.is_empty() && !view.site.places().is_empty())
+            .then(|| remaining_routes::gather(view, board, now, requests, &barred));
+        Self { barred, order, ..Self::default() }
     }
 
     /// Keeps these from later requests.
@@ -51,11 +53,25 @@ impl Occupancy {
         self.blocked.extend(places);
     }
 
-    /// An area admits one robot less than it has seats, so that those inside can move.
-    fn admits(&self, view: &FleetProjection, robot_id: &RobotId, place: &crate::site::Place) -> bool {
-        let Some(area) = place.waypoint().map(|w| view.site.waypoint(w).area) else { return true };
-        let Some(inside) = self.inside.get(&area).filter(|inside| !inside.contains(robot_id)) else { return true };
-        (inside.len() as u64) < view.site.area_capacity(area).saturating_sub(1).max(1)
+    /// Whether the robot would leave a seat of the place to others that need one.
+    pub fn is_spare(&self, place: PlaceIx) -> bool {
+        self.order.as_ref().is_none_or(|order| order.is_spare(place))
+    }
+
+    /// Whether the robot should go to a bay, since it bars others and nobody can go on before it.
+    pub fn goes_aside(&mut self, robot_id: &RobotId) -> bool {
+        self.order.as_mut().is_some_and(|order| order.goes_aside(robot_id))
+    }
+
+    /// Checks that the robot may stand where a grant lets it drive to.
+    fn check_order(&mut self, view: &FleetProjection, robot_id: &RobotId, after: &Mover) -> Result<(), Refused> {
+        match &mut self.order {
+            // The twin that forgets capacities knows of no order either.
+            Some(order) if !view.bugs.capacity_is_forgotten() => {
+                order.check_grant(robot_id, after).map_err(Refused::Unsafe)
+            }
+            _ => Ok(()),
+        }
     }
 }
 
@@ -74,10 +90,31 @@ pub(super) fn holds(view: &FleetProjection, robot_id: &RobotId, place: PlaceIx) 
     row.is_some_and(|place| place.row.holder(robot_id).is_some())
 }
 
-/// Whether the robot can have all of them now.
-pub(super) fn can_grant(view: &FleetProjection, robot_id: &RobotId, needed: &[PlaceIx], occupancy: &Occupancy) -> bool {
+/// Whether the robot can have all of them now, whatever becomes of others.
+pub(super) fn has_way(view: &FleetProjection, robot_id: &RobotId, needed: &[PlaceIx], occupancy: &Occupancy) -> bool {
     let is_open = |place: &PlaceIx| !occupancy.barred.contains(place) || holds(view, robot_id, *place);
     needed.iter().all(is_open) && have_room(view, robot_id, needed, occupancy)
+}
+
+/// Checks that the robot can have all of them now, and that all can go on once it stands `after` them.
+///
+/// # Errors
+/// Why not.
+pub(super) fn check_grant(
+    view: &FleetProjection,
+    robot_id: &RobotId,
+    needed: &[PlaceIx],
+    after: Option<&Mover>,
+    occupancy: &mut Occupancy,
+) -> Result<(), Refused> {
+    if !has_way(view, robot_id, needed, occupancy) {
+        return Err(Refused::NoRoom);
+    }
+    // Where nothing is reserved, nobody is kept from anything.
+    match after.filter(|_| !needed.is_empty()) {
+        Some(after) => occupancy.check_order(view, robot_id, after),
+        None => Ok(()),
+    }
 }
 
 /// The same of places on a stretch that was released to it already: a block since then takes nothing back, a fleet stop does.
@@ -101,9 +138,6 @@ fn have_room(view: &FleetProjection, robot_id: &RobotId, needed: &[PlaceIx], occ
         if view.refused.is_place_aside(&view.site.place(*ix).place_id) {
             return false;
         }
-        if !occupancy.admits(view, robot_id, view.site.place(*ix)) {
-            return false;
-        }
         let place = view.places.get(view.site.place(*ix).place_id.as_str()).map(|p| &p.row);
         place.is_some_and(|p| match p.holder(robot_id) {
             Some(holder) => holder.state != HolderState::Revoking,
@@ -112,22 +146,30 @@ fn have_room(view: &FleetProjection, robot_id: &RobotId, needed: &[PlaceIx], occ
     })
 }
 
-/// Places that a request keeps free for itself. While there is no seat where it goes to, only that seat: who leaves the seat may need the same
-/// passage. While the area there admits nobody, nothing: who is inside may need the seat.
+/// Places that a refused request keeps free for itself.
+///
+/// While there is no seat where it goes to, only that seat: who leaves the seat may need the same passage. Nothing, if it could not have them
+/// though all were free: others must go first then.
 pub(super) fn kept_free(
     view: &FleetProjection,
     robot_id: &RobotId,
     needed: &[PlaceIx],
-    occupancy: &Occupancy,
+    after: Option<&Mover>,
+    occupancy: &mut Occupancy,
 ) -> Vec<PlaceIx> {
-    let place = |ix: &PlaceIx| view.site.place(*ix);
-    if !needed.iter().all(|ix| occupancy.admits(view, robot_id, place(ix))) {
+    if occupancy.order.as_ref().is_some_and(|order| order.is_walled(robot_id)) {
         return Vec::new();
     }
-    let (seats, passages): (Vec<_>, Vec<_>) = needed.iter().partition(|ix| place(ix).waypoint().is_some());
+    let is_seat = |ix: &PlaceIx| view.site.place(*ix).waypoint().is_some();
+    let (seats, passages): (Vec<PlaceIx>, Vec<PlaceIx>) = needed.iter().copied().partition(is_seat);
     let is_barred = |ix: &PlaceIx| occupancy.blocked.contains(ix) || occupancy.barred.contains(ix);
-    let is_free = |ix: &PlaceIx| has_seat(view, robot_id, *ix) && !is_barred(ix);
-    if seats.iter().all(is_free) { [seats, passages].concat() } else { seats }
+    if !seats.iter().all(|ix| has_seat(view, robot_id, *ix) && !is_barred(ix)) {
+        return seats;
+    }
+    match after.map_or(Ok(()), |after| occupancy.check_order(view, robot_id, after)) {
+        Ok(()) => [seats, passages].concat(),
+        Err(_) => Vec::new(),
+    }
 }
 
 fn has_seat(view: &FleetProjection, robot_id: &RobotId, ix: PlaceIx) -> bool {
@@ -135,11 +177,26 @@ fn has_seat(view: &FleetProjection, robot_id: &RobotId, ix: PlaceIx) -> bool {
     place.is_some_and(|p| p.holder(robot_id).is_some() || starts::has_room(view, ix, p, robot_id))
 }
 
-/// Writes the robot into each of them that it does not hold.
-pub(super) fn grant_places(tx: &mut Tx, robot_id: &RobotId, needed: &[PlaceIx], occupancy: &mut Occupancy) {
+/// Notes that the robot was refused for want of an order.
+pub(super) fn note_refused(robot_id: &RobotId, occupancy: &mut Occupancy) {
+    if let Some(order) = &mut occupancy.order {
+        order.note_refused(robot_id);
+    }
+}
+
+/// Writes the robot into each of them that it does not hold. It stands `after` them then; none: on a stretch that it had before.
+pub(super) fn grant_places(
+    tx: &mut Tx,
+    robot_id: &RobotId,
+    needed: &[PlaceIx],
+    after: Option<Mover>,
+    occupancy: &mut Occupancy,
+) {
+    if let Some((order, after)) = occupancy.order.as_mut().zip(after) {
+        order.put(robot_id, after);
+    }
     let first = next_generation(tx.view, robot_id, &tx.now) * GRANTS_PER_GENERATION;
     for (grant_id, ix) in (first..).zip(needed) {
-        occupancy.enter(tx.view, robot_id, tx.view.site.place(*ix));
         let id = tx.view.site.place(*ix).place_id.clone();
         let Some(mut place) = tx.view.places.get(id.as_str()).map(|p| p.row.clone()) else { continue };
         if place.holder(robot_id).is_none() {

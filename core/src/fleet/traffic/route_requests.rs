@@ -6,6 +6,7 @@
 use super::routing;
 use crate::desired_state::Assignment;
 use crate::fleet::projection::liveness::{self, Board};
+use crate::fleet::projection::memory::Waiting;
 use crate::fleet::projection::rows::{HolderState, Place, PlaceHolder};
 use crate::fleet::projection::state::{self, FleetProjection};
 use crate::fleet::tasks::plausible;
@@ -57,6 +58,16 @@ pub fn waits(view: &FleetProjection, robot_id: &RobotId) -> bool {
     view.waits.contains_key(robot_id)
 }
 
+/// Whether another robot waits for a place that has no seat left.
+pub fn is_waited_for(view: &FleetProjection, robot_id: &RobotId, place_id: &PlaceId) -> bool {
+    let is_full = || {
+        let row = view.places.get(place_id.as_str()).map(|place| &place.row);
+        row.is_some_and(|row| row.holders.len() >= row.capacity as usize)
+    };
+    let wants = |wait: &Waiting| wait.for_order.is_none() && wait.places.contains(place_id);
+    view.waits.iter().any(|(other, wait)| other != robot_id && wants(wait)) && is_full()
+}
+
 /// The robot is inside a passage and has no standing place to go on to: its task ended there.
 pub(super) fn bars_passage(view: &FleetProjection, robot_id: &RobotId) -> bool {
     let mut inside = false;
@@ -76,7 +87,7 @@ fn class_of(view: &FleetProjection, a: &Attempt) -> Class {
 }
 
 /// An accepted attempt of a robot that is heard, not held and not told to stop.
-fn may_drive(view: &FleetProjection, a: &Attempt, live: &NewestHeartbeat, board: &Board, now: &Now) -> bool {
+pub(super) fn may_drive(view: &FleetProjection, a: &Attempt, live: &NewestHeartbeat, board: &Board, now: &Now) -> bool {
     let working = matches!(
         a.phase,
         AttemptPhase::Accepted | AttemptPhase::Navigating | AttemptPhase::Executing | AttemptPhase::Paused

@@ -50,7 +50,8 @@ async fn who_stands_for_a_place_for_a_minute_is_written_down_each_minute() {
         w.until("it has its way, or stands for it", |s| s.has("r1", "corridor")).await;
         w.r("r1").drives = false;
     }
-    w.until("r2 stands before it", |s| s.holders("wait-b") == [("r2".to_owned(), HolderState::Inside)]).await;
+    // Nobody needs its place, so it goes to no bay.
+    w.until("r2 stands at B", |s| s.holders("B") == [("r2".to_owned(), HolderState::Inside)]).await;
     w.pass_while(30, "not yet a minute", |s| s.control("r2").waited_for_place.is_none()).await;
     let seen = w.until("it is written down", |s| s.control("r2").waited_for_place.is_some()).await;
     let first = seen.control("r2").waited_for_place;
@@ -92,8 +93,8 @@ async fn a_place_that_a_robot_says_it_is_in_is_nobody_elses_though_no_heartbeat_
 }
 
 #[tokio::test(start_paused = true)]
-async fn an_area_admits_one_robot_less_than_it_has_seats() {
-    // The room at B: three seats, so two robots.
+async fn an_area_fills_to_its_last_seat_while_all_inside_can_still_leave() {
+    // The room at B: three seats, two of them taken.
     let room = ["b-in", "b-out", "b-far", "B", "park-b", "charge"];
     let mut site = CORRIDOR.replacen("]\n\nwaypoint", "  { id = \"room\" },\n]\n\nwaypoint", 1);
     for id in room {
@@ -104,9 +105,14 @@ async fn an_area_admits_one_robot_less_than_it_has_seats() {
     w.robot("r2", "charge").await;
     w.robot("r3", "park-a").await;
     w.submit_with("T1", "A", "B", |raw| (raw.robot_id, raw.stall_ms) = ("r3".to_owned(), Some(3_600_000))).await;
-    w.until("r3 stands before the room", |s| s.holders("wait-a") == [("r3".to_owned(), HolderState::Inside)]).await;
-    w.pass_while(60, "there is a seat and it stays free", |s| !s.has("r3", "B") && s.holders("B").is_empty()).await;
+    let is_inside = |s: &crate::harness::Seen, robot: &str, place: &str| {
+        s.holders(place) == [(robot.to_owned(), HolderState::Inside)]
+    };
+    let r3_inside = |s: &crate::harness::Seen| is_inside(s, "r3", "B");
+    w.until("all three are inside", |s| r3_inside(s) && is_inside(s, "r1", "park-b") && is_inside(s, "r2", "charge"))
+        .await;
     w.submit_with("T2", "A", "park-a", |raw| raw.robot_id = "r1".to_owned()).await;
+    w.until_phase("T2", Phase::Succeeded).await;
     w.until_phase("T1", Phase::Succeeded).await;
     w.lawful().await;
 }
