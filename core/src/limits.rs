@@ -245,6 +245,8 @@ pub const SAFE_ORDER_ROBOTS_MAX: usize = 256;
 pub const SAFE_ORDER_TRIES_MAX: u64 = 64;
 /// Robots that such a search looks at in all its tries together, each as often as it does: some milliseconds.
 pub const SAFE_ORDER_LOOKS_MAX: usize = 16_384;
+/// The same of all searches of one round of grants: a turn of the planner must not take longer than some 20 ms where many wait for each other.
+pub const SAFE_ORDER_ROUND_LOOKS_MAX: usize = 65_536;
 /// Bays whose ways are measured from a waypoint, the nearest by the beeline: each costs a distance field, which is remembered.
 pub const BAYS_LOOKED_AT_MAX: usize = 64;
 /// Bays that are tried for one robot, the nearest by their ways: where eight are taken, the next is seldom free or near.

@@ -32,7 +32,8 @@ pub(super) fn step_aside(
         Some(place) => stands_in(tx.view, robot_id, place),
         None => route_requests::bars_passage(tx.view, robot_id),
     };
-    if !stands || !(is_in_the_way(tx.view, robot_id, place) || occupancy.goes_aside(robot_id)) {
+    let seat = occupancy.seat_aside(robot_id);
+    if !stands || !(seat.is_some() || is_in_the_way(tx.view, robot_id, place)) {
         return false;
     }
     let left: Vec<_> =
@@ -46,7 +47,7 @@ pub(super) fn step_aside(
         direct.is_some_and(|direct| direct.len() < rest.len())
     });
     let direct = goes_round.then_some(None);
-    let bays: Vec<WaypointIx> = find_bays(tx.view, robot_id, here, goal, occupancy);
+    let bays: Vec<WaypointIx> = find_bays(tx.view, robot_id, (here, goal), seat, occupancy);
     for via in direct.into_iter().chain(bays.into_iter().map(Some)) {
         let Some(mut route) = routing::route(tx.view, here, via, &left) else { continue };
         route[0].ends_step = None;
@@ -78,16 +79,18 @@ fn is_in_the_way(view: &FleetProjection, robot_id: &RobotId, stands: Option<Plac
         || orders.any(|robots| robots.contains(robot_id))
 }
 
-/// Bays with a seat that nobody else needs, by the whole way over them to the goal. At most so many as are tried for one robot.
+/// Bays with a seat that nobody else needs, or that the order sends it to, by the whole way over them to the goal. At most so many as are tried
+/// for one robot.
 fn find_bays(
     view: &FleetProjection,
     robot_id: &RobotId,
-    here: WaypointIx,
-    goal: WaypointIx,
+    (here, goal): (WaypointIx, WaypointIx),
+    seat_aside: Option<PlaceIx>,
     occupancy: &Occupancy,
 ) -> Vec<WaypointIx> {
+    let is_fine = |seat: &PlaceIx| Some(*seat) == seat_aside || occupancy.is_spare(*seat);
     let has_seat = |bay: &WaypointIx| {
-        let seat = view.site.standing_at(*bay).filter(|seat| *bay != here && occupancy.is_spare(*seat));
+        let seat = view.site.standing_at(*bay).filter(|seat| *bay != here && is_fine(seat));
         seat.is_some_and(|seat| grants::has_way(view, robot_id, &[seat], occupancy))
     };
     let free = view.site.hold_points().chain(view.site.parks()).filter(has_seat);

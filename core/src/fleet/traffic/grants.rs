@@ -59,8 +59,8 @@ impl Occupancy {
     }
 
     /// Whether the robot should go to a bay, since it bars others and nobody can go on before it.
-    pub fn goes_aside(&mut self, robot_id: &RobotId) -> bool {
-        self.order.as_mut().is_some_and(|order| order.goes_aside(robot_id))
+    pub fn seat_aside(&mut self, robot_id: &RobotId) -> Option<PlaceIx> {
+        self.order.as_mut().and_then(|order| order.seat_aside(robot_id))
     }
 
     /// Checks that the robot may stand where a grant lets it drive to.
@@ -193,7 +193,7 @@ pub(super) fn grant_places(
     occupancy: &mut Occupancy,
 ) {
     if let Some((order, after)) = occupancy.order.as_mut().zip(after) {
-        order.put(robot_id, after);
+        order.note_grant(robot_id, after);
     }
     let first = next_generation(tx.view, robot_id, &tx.now) * GRANTS_PER_GENERATION;
     for (grant_id, ix) in (first..).zip(needed) {

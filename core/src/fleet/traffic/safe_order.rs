@@ -14,7 +14,8 @@
 //! 4. Robots that do not drive now are walls at all that they hold. Who needs a place whose seats walls have taken drives no further in the order
 //!    than it stands, and is let on only to where it bars nobody; so those that do not need that place go on.
 //! 5. All of it is integers in a fixed order, and bounded: one search looks at the first [`limits::SAFE_ORDER_ROBOTS_MAX`] robots of the connected
-//!    part, tries [`limits::SAFE_ORDER_TRIES_MAX`] orders of them and ends after [`limits::SAFE_ORDER_LOOKS_MAX`] looks. A robot has at most
+//!    part, tries [`limits::SAFE_ORDER_TRIES_MAX`] orders of them and ends after [`limits::SAFE_ORDER_LOOKS_MAX`] looks; once a
+//!    round has taken [`limits::SAFE_ORDER_ROUND_LOOKS_MAX`], a search tries the queue's order alone. A robot has at most
 //!    [`limits::ROUTE_POINTS_MAX`] points, and at most [`limits::BAYS_TRIED_MAX`] bays are tried for one. Robots beyond that stand. A bay is looked
 //!    for beyond the part: two parts may count on the same one, which costs an order at worst, never a place.
 
@@ -105,14 +106,14 @@ impl Seats {
         change(taken, needed);
     }
     fn enter(&mut self, mover: &Mover) {
-        mover.here.iter().for_each(|place| self.take(*place));
+        mover.here.iter().for_each(|place| self.take_seat(*place));
         mover.way.iter().for_each(|place| self.change(*place, |_, needed| *needed += 1));
     }
     fn leave(&mut self, mover: &Mover) {
         mover.here.iter().for_each(|place| self.change(*place, |taken, _| *taken = taken.saturating_sub(1)));
         mover.way.iter().for_each(|place| self.change(*place, |_, needed| *needed = needed.saturating_sub(1)));
     }
-    fn take(&mut self, place: PlaceIx) {
+    fn take_seat(&mut self, place: PlaceIx) {
         self.change(place, |taken, _| *taken += 1);
     }
     fn undo(&mut self, mark: usize) {
@@ -178,6 +179,8 @@ pub(super) struct SafeOrder {
     known: BTreeMap<Vec<usize>, Rc<Order>>,
     /// Robots that were refused in this round.
     refused: BTreeSet<usize>,
+    /// Robots that searches of this round looked at, each as often as they did.
+    looked: usize,
 }
 
 impl SafeOrder {
@@ -199,6 +202,7 @@ impl SafeOrder {
             users: BTreeMap::new(),
             known: BTreeMap::new(),
             refused: BTreeSet::new(),
+            looked: 0,
         };
         for (ix, (robot_id, mover)) in movers.into_iter().enumerate() {
             order.robots.push(robot_id);
@@ -219,7 +223,7 @@ impl SafeOrder {
     }
 
     /// Notes what the robot was granted. A robot that is not among them is left out.
-    pub fn put(&mut self, robot_id: &RobotId, after: Mover) {
+    pub fn note_grant(&mut self, robot_id: &RobotId, after: Mover) {
         if let Some(ix) = self.index.get(robot_id).copied() {
             self.seats.leave(&self.movers[ix]);
             self.place(ix, after);
@@ -245,7 +249,10 @@ impl SafeOrder {
         let leaves_seat = |place: &PlaceIx| self.seats.needed[place.at()] == 0 || self.seats.has_seat(*place);
         let bars_nobody = beyond.is_none() || after.here.iter().all(leaves_seat);
         let stood = std::mem::replace(&mut self.movers[ix], Rc::new(after));
-        let then = self.search(&part);
+        // All that is asked of it: it need not be the best.
+        let is_enough =
+            |then: &Order| before.ends.is_subset(&then.ends) && then.ends.contains(&ix) && !then.aside.contains(&ix);
+        let then = self.search(&part, is_enough);
         let after = std::mem::replace(&mut self.movers[ix], stood);
         self.seats.undo(mark);
         let is_first = || !part.iter().any(|other| self.refused.contains(other));
@@ -258,12 +265,12 @@ impl SafeOrder {
         Err(self.name_robots(ix, &after, beyond.as_deref(), &part, (&before.ends, &then.ends)))
     }
 
-    /// Whether the order as it is begins with this robot's going to a bay. It bars others, and nobody else can go on before it.
-    pub fn goes_aside(&mut self, robot_id: &RobotId) -> bool {
-        let Some(ix) = self.index.get(robot_id).copied() else { return false };
+    /// The seat of the bay to which this robot goes, if the order as it is begins with that. It bars others, and nobody else can go on before it.
+    pub fn seat_aside(&mut self, robot_id: &RobotId) -> Option<PlaceIx> {
+        let ix = self.index.get(robot_id).copied()?;
         let stands = self.movers[ix].clone();
         let part = self.find_part(ix, &stands);
-        matches!(self.find_known(&part).first, Some((first, Some(_))) if first == ix)
+        self.find_known(&part).first.and_then(|(first, seat)| seat.filter(|_| first == ix))
     }
 
     /// Whether a grant is what an order of all begins with: the same order holds behind it.
@@ -337,23 +344,27 @@ impl SafeOrder {
         if let Some(known) = self.known.get(part) {
             return known.clone();
         }
-        let found = Rc::new(self.search(part));
+        let found = Rc::new(self.search(part, |_| false));
         self.known.insert(part.to_vec(), found.clone());
         found
     }
 
-    /// Which of these can drive to their ends one after the other, and who goes first: of all orders that are tried the first that serves most.
-    fn search(&mut self, part: &[usize]) -> Order {
+    /// Which of these can drive to their ends one after the other, and who goes first: of all orders that are tried the first that is enough, or
+    /// the first that serves most.
+    fn search(&mut self, part: &[usize], is_enough: impl Fn(&Order) -> bool) -> Order {
+        let tries = if self.looked < limits::SAFE_ORDER_ROUND_LOOKS_MAX { limits::SAFE_ORDER_TRIES_MAX } else { 1 };
         let (mut best, mut looks) = (Order::default(), 0);
-        for nth in 0..limits::SAFE_ORDER_TRIES_MAX {
+        for nth in 0..tries {
             let found = self.try_order(shuffle(part, nth), &mut looks);
-            if nth == 0 || found.ends.len() > best.ends.len() {
+            let is_found = is_enough(&found);
+            if nth == 0 || is_found || found.ends.len() > best.ends.len() {
                 best = found;
             }
-            if best.ends.len() == part.len() || looks >= limits::SAFE_ORDER_LOOKS_MAX {
+            if is_found || best.ends.len() == part.len() || looks >= limits::SAFE_ORDER_LOOKS_MAX {
                 break;
             }
         }
+        self.looked += looks;
         best
     }
 
@@ -409,13 +420,13 @@ impl SafeOrder {
 
     fn rest(&mut self, mover: &Mover) -> bool {
         if mover.ends.iter().all(|place| self.seats.is_spare(*place)) {
-            mover.ends.iter().for_each(|place| self.seats.take(*place));
+            mover.ends.iter().for_each(|place| self.seats.take_seat(*place));
             return true;
         }
         let Some(end_at) = mover.end_at else { return false };
         let bays = self.bays.find_near(end_at);
         let Some(bay) = bays.iter().find(|bay| self.is_free(&bay.way, bay.seat)) else { return false };
-        self.seats.take(bay.seat);
+        self.seats.take_seat(bay.seat);
         true
     }
 
