@@ -71,6 +71,12 @@ impl TestProgram {
         Self { name: "xtask".to_owned(), is_inside: true, path, folder: env!("CARGO_MANIFEST_DIR").into() }
     }
 
+    /// How a person tells it from others: its folder and its name.
+    pub fn label(&self) -> String {
+        let folder = self.folder.file_name().unwrap_or_default().to_string_lossy();
+        format!("{folder} {}{}", self.name, if self.is_inside { ", inside" } else { "" })
+    }
+
     /// Its place among those that wait.
     pub fn rank(&self) -> usize {
         LONG.iter().position(|name| self.name == *name && !self.is_inside).unwrap_or(LONG.len())

@@ -86,8 +86,34 @@ impl<'w> Round<'w> {
 
 /// What one printed, with when, and whether it succeeded.
 struct Ended {
+    name: String,
     lines: Vec<(String, Duration)>,
     succeeded: Result<bool>,
+}
+
+impl Ended {
+    /// Shows what it printed, and adds it up; whether it passed. One that says no result, or failed with no test that did, has failed.
+    fn show(self, count: &mut Count, times: &mut Slowest) -> bool {
+        run::print(&format!("\n---- {}", self.name));
+        let (mut own, mut has_result) = (Count::default(), false);
+        for (line, at) in &self.lines {
+            own.add(line);
+            has_result |= line.starts_with("test result: ");
+            times.add(line, *at);
+            run::print(line);
+        }
+        let succeeded = self.succeeded.unwrap_or_else(|error| {
+            run::tell_person(&format!("error: {error:#}"));
+            false
+        });
+        let passed = succeeded && has_result;
+        if !passed && own.failed == 0 {
+            run::print(&format!("{} failed: it ended without a result, or its process failed", self.name));
+            own.failed = 1;
+        }
+        *count += own;
+        passed && own.failed == 0
+    }
 }
 
 impl Round<'_> {
@@ -104,9 +130,9 @@ impl Round<'_> {
             let succeeded = self.test_command(program, choice).and_then(|mut command| {
                 run::reading(&mut command, |line| lines.push((line.to_owned(), begun.elapsed())))
             });
-            Ended { lines, succeeded }
+            Ended { name: program.label(), lines, succeeded }
         };
-        let (mut passed, mut slowest) = (true, Vec::new());
+        let (before, mut passed, mut slowest) = (count.passed, true, Vec::new());
         std::thread::scope(|scope| {
             for _ in 0..AT_ONCE {
                 let (queue, one, ended) = (&queue, &one, ended.clone());
@@ -120,20 +146,16 @@ impl Round<'_> {
                 });
             }
             drop(ended);
-            for Ended { lines, succeeded } in ends {
+            for one in ends {
                 let mut times = Slowest::new(threads());
-                for (line, at) in lines {
-                    count.add(&line);
-                    times.add(&line, at);
-                    run::print(&line);
-                }
+                passed &= one.show(count, &mut times);
                 slowest.extend(times.list());
-                passed &= succeeded.unwrap_or_else(|error| {
-                    run::tell_person(&format!("error: {error:#}"));
-                    false
-                });
             }
         });
+        if choice.filter.is_some() && count.passed == before {
+            run::tell_person("no test has such a name");
+            passed = false;
+        }
         slowest.sort_by(|a, b| b.cmp(a));
         run::say_slowest(&slowest);
         Ok(passed)
@@ -184,7 +206,26 @@ impl Count {
 
 #[cfg(test)]
 mod tests {
-    use super::Count;
+    use super::{Count, Ended};
+    use crate::slowest::Slowest;
+    use std::time::Duration;
+
+    #[test]
+    fn a_program_passes_only_with_a_result_and_whoever_fails_is_counted() {
+        let ended = |lines: &[&str], succeeded| {
+            let lines = lines.iter().map(|line| ((*line).to_owned(), Duration::ZERO)).collect();
+            let (mut count, mut times) = (Count::default(), Slowest::new(1));
+            let passed = Ended { name: "core wire".into(), lines, succeeded }.show(&mut count, &mut times);
+            (passed, count.passed, count.failed)
+        };
+        let good = "test result: ok. 7 passed; 0 failed; 0 ignored; 0 measured; 0 filtered out; finished in 0.02s";
+        let bad = "test result: FAILED. 3 passed; 2 failed; 0 ignored; 0 measured; 0 filtered out; finished in 0.02s";
+        assert_eq!(ended(&[good], Ok(true)), (true, 7, 0));
+        assert_eq!(ended(&[bad], Ok(false)), (false, 3, 2));
+        assert_eq!(ended(&["running 7 tests"], Ok(true)), (false, 0, 1), "a test ended the process");
+        assert_eq!(ended(&["running 7 tests"], Ok(false)), (false, 0, 1), "a signal did");
+        assert_eq!(ended(&[], Err(anyhow::anyhow!("no such file"))), (false, 0, 1));
+    }
 
     #[test]
     fn closing_lines_add_up_and_other_lines_do_not_count() {

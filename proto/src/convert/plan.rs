@@ -14,7 +14,7 @@ const ROBOTS_MAX: usize = 20_000;
 /// Tasks of it.
 const TASKS_MAX: usize = 100_000;
 /// Its pairs.
-const PAIRS_MAX: usize = 1_000_000;
+const PAIRS_MAX: usize = 200_000;
 /// A way is at most so long, millimetres, and takes so much energy, milliwatt-hours: more than any floor has.
 const WAY_MAX: u64 = 1 << 40;
 /// Faults that are told; a file with more of them is another file.
@@ -109,9 +109,12 @@ pub fn parse_plan(wire: v1::Plan) -> Result<PlanRecord, Violations> {
         }
     }
     let made: Vec<_> = wire.decisions.iter().map(|made| (made.robot as usize, made.task as usize)).collect();
+    let mut taken = BTreeSet::new();
     for (nth, pair) in made.iter().enumerate() {
-        if !known.contains(pair) {
-            tell_fault(&mut bad, At::top("decisions").index(nth), "must be one of the pairs");
+        let is_in_order = nth == 0 || made[nth - 1].0 < pair.0;
+        if !known.contains(pair) || !taken.insert(pair.1) || !is_in_order {
+            let fault = "must be one of the pairs, by robot, each robot and task once";
+            tell_fault(&mut bad, At::top("decisions").index(nth), fault);
         }
     }
     match at.zip(policy).filter(|_| bad.0.is_empty()) {
@@ -258,5 +261,11 @@ mod tests {
             wire.pairs[1] = wire.pairs[2];
         });
         assert_eq!(indices, ["pairs[0]", "pairs[2]", "decisions[0]"]);
+        assert_eq!(faults(&|wire| wire.decisions.swap(0, 1)), ["decisions[1]"], "they stand by robot");
+        let twice = faults(&|wire| {
+            wire.pairs.push(v1::PlanPair { robot: 1, task: 0, ..wire.pairs[0] });
+            wire.decisions.insert(1, v1::PlanDecision { robot: 1, task: 0 });
+        });
+        assert_eq!(twice, ["decisions[1]"], "a task goes to one robot");
     }
 }

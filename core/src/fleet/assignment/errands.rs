@@ -88,10 +88,11 @@ impl Wants {
     }
 }
 
-/// Whether another robot waits for the last seat of the place that this one stands in.
+/// Whether another robot waits for the last seat of the place that this one stands in, or for this one to go first.
 fn is_wanted(view: &FleetProjection, robot_id: &RobotId, here: WaypointIx) -> bool {
     let place = view.site.standing_at(here).map(|place| &view.site.place(place).place_id);
     place.is_some_and(|place_id| route_requests::is_waited_for(view, robot_id, place_id))
+        || route_requests::is_in_an_orders_way(view, robot_id)
 }
 
 /// Whether an idle robot would do anything while no task waits. Where it would go is not looked for.

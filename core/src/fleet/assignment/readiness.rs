@@ -53,7 +53,7 @@ pub(in crate::fleet) fn settle(view: &mut FleetProjection, now: Now, plan: &mut 
 pub(in crate::fleet) fn reckon_starts(view: &mut FleetProjection, now: Now, moved: &[TaskId]) {
     let left: Vec<&TaskId> = moved.iter().filter(|task_id| view.queue.rank(task_id).is_some()).collect();
     for task_id in view.starts.pick_tasks(left.into_iter(), now.utc) {
-        match view.start_outlook(&task_id) {
+        match view.start_outlook(&task_id, now.utc) {
             Some(outlook) => view.starts.reckon_task(&task_id, &outlook, now.utc),
             None => view.starts.forget_task(&task_id),
         }

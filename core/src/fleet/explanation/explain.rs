@@ -98,7 +98,7 @@ pub fn task(view: &FleetProjection, board: &Board, now: &Now, task_id: &TaskId) 
     let meant = wait_reasons::meant_for(view, now, task);
     // Who is busy comes back; of one that is kept from work nobody knows.
     let is_awaited = |c: &RobotCandidate| c.reason.as_ref().is_none_or(|why| why.code == Code::RobotBusy);
-    let outlook = view.start_outlook(task_id).filter(|_| candidates.iter().any(is_awaited));
+    let outlook = view.start_outlook(task_id, now.utc).filter(|_| candidates.iter().any(is_awaited));
     let start = outlook.and_then(|outlook| view.starts.estimate(&outlook, now.utc));
     let expected = meant.map(|meant| meant.free.max(now.utc)).or_else(|| is_next.then_some(now.utc));
     let expected = expected.or_else(|| start.map(|start| start.p50));

@@ -312,7 +312,7 @@ pub fn of_robot(view: &FleetProjection, board: &Board, now: &Now, robot_id: &Rob
 /// a free seat, robots that start there, a stop, whoever came first, or a free seat that others go to first. None: it waits for none.
 pub fn place_wait(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> {
     let wait = view.waits.get(robot_id)?;
-    if let Some(robots) = wait.for_order.as_ref().filter(|robots| !robots.is_empty()) {
+    if let Some(robots) = &wait.for_order {
         return Some(order_wait(wait, robots));
     }
     let mut reason = Reason::from(Code::PlaceOccupied);
@@ -343,7 +343,8 @@ pub fn place_wait(view: &FleetProjection, robot_id: &RobotId) -> Option<Reason> 
 fn order_wait(wait: &Waiting, robots: &[RobotId]) -> Reason {
     let places = wait.places.iter().map(ToString::to_string).collect::<Vec<_>>();
     let names = robots.iter().map(ToString::to_string).collect::<Vec<_>>();
-    let told = format!("{}: an order with {}", places.join(", "), names.join(", "));
+    let with = if names.is_empty() { "others".to_owned() } else { names.join(", ") };
+    let told = format!("{}: an order with {with}", places.join(", "));
     let reason = Reason::from(Code::UnsafeOrder).with("robots", names.join(" ")).with("places", places.join(" "));
     reason.with(WAITS_FOR, told)
 }
@@ -360,7 +361,9 @@ fn in_the_way(
     let names = |ids: &mut dyn Iterator<Item = &RobotId>| ids.filter(others).map(ToString::to_string).collect();
     let mine = view.waits.get(robot_id).map(|w| w.since).unwrap_or_default();
     let wants = |other: &PlaceId| places.contains(other);
-    let earlier = view.waits.iter().filter(|(_, w)| w.since <= mine && w.places.iter().any(wants)).map(|(id, _)| id);
+    // Who waits for an order keeps nothing from anybody.
+    let keeps = |w: &Waiting| w.for_order.is_none() && w.since <= mine && w.places.iter().any(wants);
+    let earlier = view.waits.iter().filter(|(_, w)| keeps(w)).map(|(id, _)| id);
     let closed = engaged_stops::closed(view);
     let has_seat = |p: &Place| {
         let known = view.site.find_place(&p.place_id);

@@ -1,7 +1,7 @@
 //! The newest plans of `rolling`, each with all that it was decided by: the same decision can be made of it once more.
 //!
 //! `assignment::rolling` notes them; people read them. Memory of this process: no row, and gone with a start. Nothing is decided by them.
-//! Invariant: some of the newest plans and no more pairs than a bound, but always the newest.
+//! Invariant: some of the newest plans and no more of what they weighed than a bound, but always the newest.
 
 use crate::ids::{RobotId, TaskId};
 use crate::planner_policy::PlannerPolicy;
@@ -77,6 +77,12 @@ pub struct Weighed {
     pub pairs: Vec<WeighedPair>,
 }
 
+impl Weighed {
+    fn size(&self) -> usize {
+        self.robots.len() + self.tasks.len() + self.pairs.len()
+    }
+}
+
 /// One plan.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PlanRecord {
@@ -98,14 +104,15 @@ pub struct Plans {
     /// The oldest first.
     newest: VecDeque<Arc<PlanRecord>>,
     counted: u64,
-    pairs: usize,
+    /// Robots, tasks and pairs of all of them.
+    weighed: usize,
 }
 
 impl Plans {
     /// Plans that are remembered.
     pub const MAX: usize = 64;
-    /// Pairs of all of them, unless the newest alone has more: some 5 MB.
-    const PAIRS_MAX: usize = 100_000;
+    /// Robots, tasks and pairs of all of them, unless the newest alone has more: some 6 MB.
+    const WEIGHED_MAX: usize = 100_000;
 
     /// The newest first.
     pub fn iter(&self) -> impl Iterator<Item = &Arc<PlanRecord>> {
@@ -126,11 +133,11 @@ impl Plans {
         made: Vec<(usize, usize)>,
     ) {
         self.counted += 1;
-        self.pairs += weighed.pairs.len();
+        self.weighed += weighed.size();
         self.newest.push_back(Arc::new(PlanRecord { number: self.counted, at, policy: policy.clone(), weighed, made }));
-        while self.newest.len() > Self::MAX || (self.pairs > Self::PAIRS_MAX && self.newest.len() > 1) {
+        while self.newest.len() > Self::MAX || (self.weighed > Self::WEIGHED_MAX && self.newest.len() > 1) {
             let oldest = self.newest.pop_front();
-            self.pairs -= oldest.map_or(0, |plan| plan.weighed.pairs.len());
+            self.weighed -= oldest.map_or(0, |plan| plan.weighed.size());
         }
     }
 }
@@ -156,9 +163,9 @@ mod tests {
         assert_eq!(numbers(&plans), (3..=66).rev().collect::<Vec<_>>());
         assert_eq!(plans.get(None).map(|plan| plan.number), Some(66));
         assert!(plans.get(Some(2)).is_none() && plans.get(Some(3)).is_some());
-        noted(&mut plans, Plans::PAIRS_MAX - 1);
+        noted(&mut plans, Plans::WEIGHED_MAX - 1);
         assert_eq!(numbers(&plans), [67, 66]);
-        noted(&mut plans, 2 * Plans::PAIRS_MAX);
+        noted(&mut plans, 2 * Plans::WEIGHED_MAX);
         assert_eq!(numbers(&plans), [68], "the newest stays, however large");
         noted(&mut plans, 1);
         assert_eq!(numbers(&plans), [69]);

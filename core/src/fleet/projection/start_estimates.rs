@@ -79,6 +79,10 @@ pub struct Starts {
 impl Starts {
     /// A ready task got a robot.
     pub(in crate::fleet) fn note_start(&mut self, task_id: &TaskId, now: Utc) {
+        // A clock that was put back makes all that was noted worthless.
+        if self.given.back().is_some_and(|newest| *newest > now) {
+            (self.given, self.noted, self.due) = Default::default();
+        }
         self.given.push_back(now);
         if self.given.len() > STARTS_MAX {
             self.given.pop_front();

@@ -273,11 +273,11 @@ impl FleetProjection {
         self.energy.get(robot).unwrap_or(&RobotEnergy::MODEL)
     }
 
-    /// What a ready task has before it until it gets a robot. None: it is not ready.
-    pub fn start_outlook(&self, task_id: &TaskId) -> Option<Outlook> {
+    /// What a ready task has before it until it gets a robot. A robot that should be free by now says nothing of it. None: it is not ready.
+    pub fn start_outlook(&self, task_id: &TaskId, now: Utc) -> Option<Outlook> {
         let (position, rank) = self.queue.position(task_id).zip(self.queue.rank(task_id))?;
         let meant = self.meant.get(task_id).filter(|meant| self.held_by(&meant.robot_id).is_some());
-        let meant_free = meant.map(|meant| meant.free);
+        let meant_free = meant.map(|meant| meant.free).filter(|free| *free > now);
         Some(Outlook { position, since: rank.since, meant_free })
     }
 

@@ -32,8 +32,11 @@ pub(super) fn step_aside(
         Some(place) => stands_in(tx.view, robot_id, place),
         None => route_requests::bars_passage(tx.view, robot_id),
     };
+    if !stands {
+        return false;
+    }
     let seat = occupancy.seat_aside(robot_id);
-    if !stands || !(seat.is_some() || is_in_the_way(tx.view, robot_id, place)) {
+    if seat.is_none() && !is_in_the_way(tx.view, robot_id, place) {
         return false;
     }
     let left: Vec<_> =
@@ -73,14 +76,12 @@ fn is_in_the_way(view: &FleetProjection, robot_id: &RobotId, stands: Option<Plac
     let is_meant = |ix: &PlaceIx| stands.is_none_or(|place| place == *ix);
     let held = remaining_routes::held(view, robot_id).into_iter().filter(is_meant);
     let mut held = held.map(|ix| &view.site.place(ix).place_id);
-    let mut orders =
-        view.waits.iter().filter(|(other, _)| *other != robot_id).filter_map(|(_, w)| w.for_order.as_ref());
     held.any(|place_id| route_requests::is_waited_for(view, robot_id, place_id))
-        || orders.any(|robots| robots.contains(robot_id))
+        || route_requests::is_in_an_orders_way(view, robot_id)
 }
 
-/// Bays with a seat that nobody else needs, or that the order sends it to, by the whole way over them to the goal. At most so many as are tried
-/// for one robot.
+/// The bay that the order sends it to, then those with a seat that nobody else needs, by the whole way over them to the goal. At most so many as
+/// are tried for one robot.
 fn find_bays(
     view: &FleetProjection,
     robot_id: &RobotId,
@@ -99,7 +100,7 @@ fn find_bays(
         Some((there_mm + view.router.distance_mm(bay, goal)?, bay))
     };
     let mut bays: Vec<(u64, WaypointIx)> = free.filter_map(far).collect();
-    bays.sort_unstable();
+    bays.sort_unstable_by_key(|(way_mm, bay)| (view.site.standing_at(*bay) != seat_aside, *way_mm, *bay));
     bays.into_iter().take(limits::BAYS_TRIED_MAX).map(|(_, bay)| bay).collect()
 }
 

@@ -6,7 +6,7 @@
 use super::bay_ways::BayWays;
 use super::route_requests::{self, Request};
 use super::safe_order::{Mover, SafeOrder};
-use super::{routing, starts};
+use super::{engaged_stops, routing, starts};
 use crate::desired_state::RoutePoint;
 use crate::fleet::projection::liveness::{self, Board};
 use crate::fleet::projection::state::{self, FleetProjection};
@@ -77,7 +77,7 @@ fn find_mover(view: &FleetProjection, board: &Board, now: &Now, robot_id: &Robot
         return if leaves { mover } else { wall(mover) };
     };
     let on_route = find_route(view, a, &held);
-    match live.filter(|live| route_requests::may_drive(view, a, live, board, now)) {
+    match live.filter(|live| route_requests::may_drive(view, a, live, board, now) && can_move(view, live)) {
         Some(live) => {
             on_route.unwrap_or_else(|| Mover::standing(routing::find(view, live.report.vitals.waypoint.as_ref()), held))
         }
@@ -94,6 +94,11 @@ fn find_route(view: &FleetProjection, a: &Attempt, held: &[PlaceIx]) -> Option<M
     on_route(&view.site, &work.route, work.released_index.unwrap_or(0) as usize, held)
 }
 
+/// Whether nothing that the robot says of itself, and no fleet stop, keeps it where it is.
+fn can_move(view: &FleetProjection, live: &NewestHeartbeat) -> bool {
+    eligibility::reported(live).is_ok() && engaged_stops::check_stops(view, &live.robot_id, Some(live)).is_ok()
+}
+
 /// Whether a robot without work would take an errand.
 fn would_park(view: &FleetProjection, board: &Board, now: &Now, live: &NewestHeartbeat) -> bool {
     let robot_id = &live.robot_id;
@@ -103,7 +108,7 @@ fn would_park(view: &FleetProjection, board: &Board, now: &Now, live: &NewestHea
         && view.site.collisions_modelled()
         && !is_held
         && !is_unwilling
-        && view.robot_holds(robot_id).next().is_none()
         && view.drain_of(robot_id).is_none()
-        && eligibility::reported(live).is_ok()
+        && eligibility::decided_by_people(view, robot_id, Some(live)).is_ok()
+        && can_move(view, live)
 }

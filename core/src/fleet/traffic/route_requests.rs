@@ -68,6 +68,12 @@ pub fn is_waited_for(view: &FleetProjection, robot_id: &RobotId, place_id: &Plac
     view.waits.iter().any(|(other, wait)| other != robot_id && wants(wait)) && is_full()
 }
 
+/// Whether another robot waits for an order that this one is in the way of.
+pub fn is_in_an_orders_way(view: &FleetProjection, robot_id: &RobotId) -> bool {
+    let others = view.waits.iter().filter(|(other, _)| *other != robot_id);
+    others.filter_map(|(_, wait)| wait.for_order.as_ref()).any(|robots| robots.contains(robot_id))
+}
+
 /// The robot is inside a passage and has no standing place to go on to: its task ended there.
 pub(super) fn bars_passage(view: &FleetProjection, robot_id: &RobotId) -> bool {
     let mut inside = false;

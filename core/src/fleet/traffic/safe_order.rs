@@ -373,18 +373,20 @@ impl SafeOrder {
         let movers = robots.iter().map(|ix| (*ix, self.movers[*ix].clone())).collect();
         let mut left = Left { robots, movers, aside: BTreeSet::new() };
         let mut found = Order { ends: left.robots.iter().copied().collect(), ..Order::default() };
+        let mut first = None;
         while !left.robots.is_empty() && *looks < limits::SAFE_ORDER_LOOKS_MAX {
             *looks += left.robots.len();
             let moved = self.drive_all_to_end(&mut left).map(|ix| (ix, None));
             let moved = moved.or_else(|| self.move_aside(&mut left, Aside::Bars));
             let moved = moved.or_else(|| self.drive_to_goal(&mut left).map(|ix| (ix, None)));
             let moved = moved.or_else(|| self.move_aside(&mut left, Aside::Stands));
-            match moved {
-                Some((ix, Some(_))) => _ = found.aside.insert(ix),
-                Some((_, None)) => {}
-                None => break,
+            let Some((_, seat)) = moved else { break };
+            first = first.or(moved);
+            // Who goes aside and nobody goes on behind it has gone for nothing.
+            if seat.is_none() {
+                found.aside.append(&mut left.aside);
+                found.first = found.first.or(first);
             }
-            found.first = found.first.or(moved);
         }
         self.seats.undo(mark);
         found.ends.retain(|ix| !left.robots.contains(ix));
@@ -400,9 +402,6 @@ impl SafeOrder {
             first = first.or(is_there.then_some(*ix));
             !is_there
         });
-        if first.is_some() {
-            left.aside.clear();
-        }
         first
     }
 
@@ -482,7 +481,6 @@ impl SafeOrder {
                 let moved = Mover { here: vec![seat], at: Some(*goal), way, ends, goals, ..Mover::clone(&mover) };
                 self.seats.enter(&moved);
                 left.movers.insert(*ix, Rc::new(moved));
-                left.aside.clear();
                 return Some(*ix);
             }
             self.seats.undo(mark);
