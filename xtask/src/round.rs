@@ -92,27 +92,28 @@ struct Ended {
 }
 
 impl Ended {
-    /// Shows what it printed, and adds it up; whether it passed. One that says no result, or failed with no test that did, has failed.
-    fn show(self, count: &mut Count, times: &mut Slowest) -> bool {
+    /// What its tests added up to; whether it passed. One that says no result, or that failed though no test of it did, has failed.
+    fn judge(&self) -> (Count, bool) {
+        let mut count = Count::default();
+        self.lines.iter().for_each(|(line, _)| count.add(line));
+        let has_result = self.lines.iter().any(|(line, _)| line.starts_with("test result: "));
+        let succeeded = matches!(self.succeeded, Ok(true)) && has_result;
+        count.failed += u64::from(!succeeded && count.failed == 0);
+        (count, succeeded && count.failed == 0)
+    }
+
+    /// Shows what it printed, with how it came out where no test says so.
+    fn show(&self, times: &mut Slowest) {
         run::print(&format!("\n---- {}", self.name));
-        let (mut own, mut has_result) = (Count::default(), false);
         for (line, at) in &self.lines {
-            own.add(line);
-            has_result |= line.starts_with("test result: ");
             times.add(line, *at);
             run::print(line);
         }
-        let succeeded = self.succeeded.unwrap_or_else(|error| {
-            run::tell_person(&format!("error: {error:#}"));
-            false
-        });
-        let passed = succeeded && has_result;
-        if !passed && own.failed == 0 {
-            run::print(&format!("{} failed: it ended without a result, or its process failed", self.name));
-            own.failed = 1;
+        match &self.succeeded {
+            Err(error) => run::tell_person(&format!("{}: {error:#}", self.name)),
+            Ok(_) if !self.judge().1 => run::tell_person(&format!("{} failed, or ended without a result", self.name)),
+            Ok(_) => {}
         }
-        *count += own;
-        passed && own.failed == 0
     }
 }
 
@@ -148,7 +149,10 @@ impl Round<'_> {
             drop(ended);
             for one in ends {
                 let mut times = Slowest::new(threads());
-                passed &= one.show(count, &mut times);
+                one.show(&mut times);
+                let (own, has_passed) = one.judge();
+                *count += own;
+                passed &= has_passed;
                 slowest.extend(times.list());
             }
         });
@@ -207,15 +211,13 @@ impl Count {
 #[cfg(test)]
 mod tests {
     use super::{Count, Ended};
-    use crate::slowest::Slowest;
     use std::time::Duration;
 
     #[test]
     fn a_program_passes_only_with_a_result_and_whoever_fails_is_counted() {
         let ended = |lines: &[&str], succeeded| {
             let lines = lines.iter().map(|line| ((*line).to_owned(), Duration::ZERO)).collect();
-            let (mut count, mut times) = (Count::default(), Slowest::new(1));
-            let passed = Ended { name: "core wire".into(), lines, succeeded }.show(&mut count, &mut times);
+            let (count, passed) = Ended { name: "core wire".into(), lines, succeeded }.judge();
             (passed, count.passed, count.failed)
         };
         let good = "test result: ok. 7 passed; 0 failed; 0 ignored; 0 measured; 0 filtered out; finished in 0.02s";
