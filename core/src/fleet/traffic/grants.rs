@@ -58,7 +58,7 @@ impl Occupancy {
         self.order.as_ref().is_none_or(|order| order.is_spare(place))
     }
 
-    /// Whether the robot should go to a bay, since it bars others and nobody can go on before it.
+    /// The seat of the bay that the robot should go to, since in the order nobody goes on before it. None: it need not.
     pub fn seat_aside(&mut self, robot_id: &RobotId) -> Option<PlaceIx> {
         self.order.as_mut().and_then(|order| order.seat_aside(robot_id))
     }

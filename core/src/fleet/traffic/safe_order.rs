@@ -265,7 +265,7 @@ impl SafeOrder {
         Err(self.name_robots(ix, &after, beyond.as_deref(), &part, (&before.ends, &then.ends)))
     }
 
-    /// The seat of the bay to which this robot goes, if the order as it is begins with that. It bars others, and nobody else can go on before it.
+    /// The seat of the bay to which this robot goes, if the order as it is begins with that: nobody else goes on before it.
     pub fn seat_aside(&mut self, robot_id: &RobotId) -> Option<PlaceIx> {
         let ix = self.index.get(robot_id).copied()?;
         let stands = self.movers[ix].clone();
